@@ -1,0 +1,6 @@
+"""space_dist: reinforcement learning that generalises over instances, with self-paced curricula, on Ray."""
+
+from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
+
+__version__ = "0.1.0"
+__all__ = ["ConfigError", "Interrupted", "LedgerError", "RunLockedError", "SpaceDistError", "__version__"]

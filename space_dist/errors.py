@@ -1,0 +1,38 @@
+"""What can go wrong, as a user sees it. Each class knows the exit code of the command it ends."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SpaceDistError(Exception):
+    """Base of every error this package raises on purpose; its text is meant for the user as it stands."""
+
+    exit_code = 1
+
+
+class ConfigError(SpaceDistError):
+    """Something the user wrote (config, CSV, command line) cannot be used. Retrying cannot help."""
+
+    exit_code = 2
+
+
+class LedgerError(SpaceDistError):
+    """A run's folder is damaged, incomplete, or belongs to another configuration."""
+
+
+class RunLockedError(SpaceDistError):
+    """Another process owns the run."""
+
+
+class Interrupted(SpaceDistError):  # noqa: N818 - an interruption is an outcome, not an error
+    """The run was asked to stop and wrote a checkpoint: `--resume` continues it."""
+
+    exit_code = 75  # EX_TEMPFAIL of sysexits.h: what batch systems take for "requeue me"
+
+
+def nearest(word: str, allowed: Iterable[str]) -> str:
+    """`"; did you mean 'eta'?"` where one of `allowed` resembles `word`, else an empty string."""
+    close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else ""

@@ -1,0 +1,534 @@
+"""A run's own folder: the truth about it.
+
+    config.yaml           what was asked for, resolved; with instances_train.csv and instances_test.csv beside it
+    status.json           where the run stands (atomic); names the last checkpoint and how much of each file it covers
+    metrics.jsonl         one row per iteration and per evaluation; a pure function of config and seed
+    curriculum.jsonl      one row per iteration: which instances were trained on
+    timing.jsonl          one row per row of metrics.jsonl: when, and how long it took
+    checkpoints/*.npz     the last two; arrays and JSON, never a pickle
+    model.npz, model.json the trained policy, once the run is done
+    log.txt               what the run said
+
+Rows carry a CRC. Rows behind the last checkpoint are *uncommitted*: a resumed run cuts them off and writes the same
+bytes again. Commits are ordered so that a kill between any two system calls leaves a folder that resumes: rows are
+flushed to disk, then the checkpoint is renamed into place, then the status.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import fcntl
+import hashlib
+import io
+import json
+import os
+import socket
+import threading
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from space_dist.errors import LedgerError, RunLockedError
+
+Row = dict[str, Any]
+State = Literal["running", "interrupted", "failed", "done"]
+
+METRICS, TIMING, CURRICULUM = "metrics.jsonl", "timing.jsonl", "curriculum.jsonl"
+ROW_FILES = (METRICS, TIMING, CURRICULUM)
+FORMAT = 1
+KEPT_CHECKPOINTS = 2
+LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
+HEARTBEAT_SECONDS = 10.0
+_MAX_STATUS_BYTES = 1 << 20
+_CRC_LENGTH = len(',"crc":"00000000"}\n')
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """`status.json`. Steps are real environment steps of training; times are seconds since the epoch."""
+
+    state: State
+    name: str
+    seed: int
+    steps: int
+    budget_steps: int
+    round: int
+    started_at: float
+    updated_at: float
+    message: str | None = None
+    committed: Mapping[str, int] = dataclasses.field(default_factory=dict)  # file name -> bytes under a checkpoint
+    checkpoint: str | None = None
+    checkpoint_sha256: str | None = None
+    fingerprint: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    fingerprint_changed: bool = False  # resumed where bit-equality is not promised
+    format: int = FORMAT
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """Everything a run needs to go on: arrays by name, and plain JSON data."""
+
+    round: int
+    arrays: Mapping[str, NDArray[Any]]
+    data: Mapping[str, Any]
+
+
+def atomic_write(path: Path, content: bytes) -> None:
+    """Write a whole file or nothing, and be sure that it is on disk."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def encode_row(row: Row) -> bytes:
+    """One line: the row as JSON with its own CRC-32 as last field."""
+    body = json.dumps(row, separators=(",", ":"), allow_nan=False)
+    return f'{body[:-1]},"crc":"{zlib.crc32(body.encode()):08x}"}}\n'.encode()
+
+
+def decode_row(line: bytes) -> Row | None:
+    """The row without its CRC; None where the line is torn or was changed."""
+    body = line[:-_CRC_LENGTH] + b"}"
+    if line[-_CRC_LENGTH:] != f',"crc":"{zlib.crc32(body):08x}"}}\n'.encode():
+        return None
+    try:
+        row = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) else None
+
+
+class Ledger:
+    """The one class that knows the paths of a run. Reading needs no lock; writing is `RunWriter`'s."""
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder).absolute()
+        self.config = self.folder / "config.yaml"
+        self.status_file = self.folder / "status.json"
+        self.checkpoints = self.folder / "checkpoints"
+        self.log = self.folder / "log.txt"
+        self.stop_file = self.folder / "stop"
+        self.lock_file = self.folder / "lock.json"
+        self.model_arrays = self.folder / "model.npz"
+        self.model_description = self.folder / "model.json"
+
+    def __repr__(self) -> str:
+        return f"Ledger({str(self.folder)!r})"
+
+    def exists(self) -> bool:
+        """Whether a run was ever started here."""
+        return self.config.exists() or self.status_file.exists()
+
+    def instances(self, split: Literal["train", "test"]) -> Path:
+        """The run's own copy of an instance set."""
+        return self.folder / f"instances_{split}.csv"
+
+    def status(self) -> Status:
+        """Read `status.json`. Raises LedgerError if it is missing or damaged."""
+        try:
+            with self.status_file.open("rb") as file:
+                content = file.read(_MAX_STATUS_BYTES + 1)
+        except FileNotFoundError:
+            raise LedgerError(f"{self.folder} holds no run: it has no status.json") from None
+        except OSError as error:
+            raise LedgerError(f"{self.status_file} cannot be read: {error.strerror}") from None
+        try:
+            data = json.loads(content)
+            crc = data.pop("crc")
+            if crc != zlib.crc32(json.dumps(data, sort_keys=True).encode()):
+                raise ValueError("checksum")
+            status = Status(**data)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            raise LedgerError(f"{self.status_file} is damaged") from None
+        if status.format != FORMAT:
+            raise LedgerError(f"{self.status_file} has format {status.format}; this version reads format {FORMAT}")
+        return status
+
+    def rows(self, name: str = METRICS, *, committed_only: bool = False) -> list[Row]:
+        """The intact rows of a file from its start; a torn last row (a run being written or killed) is left out.
+
+        Raises LedgerError if a row before the last one is damaged, naming file and row.
+        """
+        path = self.folder / name
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return []
+        if committed_only:
+            content = content[: self.status().committed.get(name, 0)]
+        lines = content.splitlines(keepends=True)
+        rows = []
+        for number, line in enumerate(lines, start=1):
+            row = decode_row(line)
+            if row is None:
+                if number == len(lines) and not line.endswith(b"\n"):
+                    break
+                raise LedgerError(f"{path}, row {number}: damaged (its checksum does not match)")
+            rows.append(row)
+        return rows
+
+    def checkpoint_files(self) -> list[Path]:
+        """Newest first."""
+        return sorted(self.checkpoints.glob("round-*.npz"), reverse=True)
+
+    def owner_alive(self) -> bool:
+        """Whether a live process works on this run now, as far as can be told from this machine."""
+        try:
+            owner = json.loads(self.lock_file.read_bytes() or b"{}")
+        except (OSError, ValueError):
+            return False
+        return isinstance(owner, dict) and _believed_alive(owner)
+
+
+def find_ledgers(paths: list[Path]) -> list[Ledger]:
+    """Every run in or below `paths`, sorted by path, each once. Raises LedgerError where there is none."""
+    found: dict[Path, Ledger] = {}
+    for path in paths:
+        if not path.exists():
+            raise LedgerError(f"{path} does not exist")
+        below = [Ledger(path)] if (path / "status.json").exists() else []
+        below += [Ledger(file.parent) for file in path.rglob("status.json") if path.is_dir()]
+        if not below:
+            raise LedgerError(f"no run found in {path}: no folder there has a status.json")
+        found |= {ledger.folder.resolve(): ledger for ledger in below}
+    return [found[key] for key in sorted(found)]
+
+
+def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
+    """An uncompressed npz; its `meta` names a SHA-256 over every array and all data."""
+    meta = {"round": checkpoint.round, "data": dict(checkpoint.data), "format": FORMAT}
+    meta["sha256"] = _digest(meta, checkpoint.arrays)
+    buffer = io.BytesIO()
+    encoded = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
+    np.savez(buffer, meta=encoded, **{f"array/{name}": array for name, array in checkpoint.arrays.items()})
+    return buffer.getvalue()
+
+
+def decode_checkpoint(content: bytes) -> Checkpoint:
+    """The inverse of `encode_checkpoint`. Raises ValueError for anything that is not exactly what was written."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
+                raise ValueError("compressed")
+            if sum(info.file_size for info in infos) > len(content):
+                raise ValueError("sizes do not add up")
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            meta = json.loads(file["meta"].tobytes())
+            arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "meta"}
+        written = meta.pop("sha256")
+        if meta["format"] != FORMAT or written != _digest(meta, arrays):
+            raise ValueError("checksum")
+        return Checkpoint(round=int(meta["round"]), arrays=arrays, data=dict(meta["data"]))
+    except (zipfile.BadZipFile, KeyError, TypeError, AttributeError, OSError, EOFError, RecursionError,
+            NotImplementedError, RuntimeError, MemoryError, zlib.error) as error:  # fmt: skip
+        raise ValueError(str(error)) from None
+
+
+def _digest(meta: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
+    digest = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+class RunWriter:
+    """The owner's side of a ledger: holds the lock, appends rows, commits checkpoints.
+
+    Use as a context manager. `restore` must be called once before the first `append`.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self._lock = _Lock(ledger.lock_file)
+        self._hashes = {name: hashlib.sha256() for name in ROW_FILES}
+        self._sizes = dict.fromkeys(ROW_FILES, 0)
+        self.status: Status | None = None
+
+    def __enter__(self) -> RunWriter:
+        with _clear_errors(self.ledger.folder):
+            self.ledger.folder.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+            self.ledger.checkpoints.mkdir(exist_ok=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def write_config(self, config: str, train: str, test: str) -> None:
+        """Record what was asked for. The config comes last: a folder that has one is complete."""
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            atomic_write(self.ledger.instances("train"), train.encode())
+            atomic_write(self.ledger.instances("test"), test.encode())
+            atomic_write(self.ledger.config, config.encode())
+
+    def restore(self) -> Checkpoint | None:
+        """Cut every row file back to the newest intact checkpoint and return it; to nothing where there is none.
+
+        Raises LedgerError if there are checkpoints and rows to build on, but none of them fit together.
+        """
+        files = self.ledger.checkpoint_files()
+        reasons = []
+        for file in files:
+            try:
+                checkpoint = decode_checkpoint(file.read_bytes())
+                prefixes = self._verified_prefixes(checkpoint)
+            except (ValueError, OSError) as error:
+                reasons.append(f"{file.name}: {error}")
+                continue
+            with self._lock.held():
+                self._cut(prefixes)
+                for newer in files[: files.index(file)]:
+                    newer.unlink()
+            return checkpoint
+        if files:
+            raise LedgerError(
+                f"{self.ledger.folder} cannot be resumed: no checkpoint is intact ({'; '.join(reasons)}). "
+                "Nothing was changed; start the run in another folder"
+            )
+        with self._lock.held():
+            self._cut(dict.fromkeys(ROW_FILES, b""))
+        return None
+
+    def _verified_prefixes(self, checkpoint: Checkpoint) -> dict[str, bytes]:
+        prefixes = {}
+        for name, (size, sha256) in checkpoint.data["files"].items():
+            if name not in ROW_FILES:
+                raise ValueError(f"it names a file {name!r} that runs do not have")
+            path = self.ledger.folder / name
+            content = path.read_bytes()[:size] if path.exists() else b""
+            if len(content) < size:
+                raise ValueError(f"{name} is shorter than it was")
+            if hashlib.sha256(content).hexdigest() != sha256:
+                raise ValueError(f"{name} has changed since")
+            prefixes[name] = content
+        return prefixes
+
+    def _cut(self, prefixes: Mapping[str, bytes]) -> None:
+        for name, content in prefixes.items():
+            with (self.ledger.folder / name).open("ab") as file:
+                file.truncate(len(content))
+                file.flush()
+                os.fsync(file.fileno())
+            self._sizes[name] = len(content)
+            self._hashes[name] = hashlib.sha256(content)
+
+    def append(self, name: str, row: Row) -> None:
+        """Add a row; it counts once a checkpoint covers it."""
+        line = encode_row(row)
+        with _clear_errors(self.ledger.folder), (self.ledger.folder / name).open("ab") as file:
+            file.write(line)
+        self._sizes[name] += len(line)
+        self._hashes[name].update(line)
+
+    def commit(self, checkpoint: Checkpoint, status: Status) -> None:
+        """Make everything so far permanent. Raises RunLockedError if another process has taken the run over."""
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            for name in ROW_FILES:
+                with (self.ledger.folder / name).open("ab") as file:
+                    os.fsync(file.fileno())
+            files = {name: (self._sizes[name], self._hashes[name].hexdigest()) for name in ROW_FILES}
+            content = encode_checkpoint(dataclasses.replace(checkpoint, data={**checkpoint.data, "files": files}))
+            path = self.ledger.checkpoints / f"round-{checkpoint.round:09d}.npz"
+            atomic_write(path, content)
+            self._write_status(
+                dataclasses.replace(
+                    status,
+                    committed=dict(self._sizes),
+                    checkpoint=path.name,
+                    checkpoint_sha256=hashlib.sha256(content).hexdigest(),
+                )
+            )
+            for old in self.ledger.checkpoint_files()[KEPT_CHECKPOINTS:]:
+                old.unlink()
+
+    def set_status(self, status: Status) -> None:
+        """Write a new status that keeps what the last commit said about files."""
+        if self.status is not None:
+            status = dataclasses.replace(
+                status,
+                committed=self.status.committed,
+                checkpoint=self.status.checkpoint,
+                checkpoint_sha256=self.status.checkpoint_sha256,
+            )
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            self._write_status(status)
+
+    def _write_status(self, status: Status) -> None:
+        data = dataclasses.asdict(status)
+        crc = zlib.crc32(json.dumps(data, sort_keys=True).encode())
+        atomic_write(self.ledger.status_file, json.dumps({**data, "crc": crc}, indent=1).encode())
+        self.status = status
+
+    def write_model(self, arrays: Mapping[str, NDArray[Any]], description: Mapping[str, Any]) -> None:
+        """Store the trained policy as `model.npz` and `model.json`."""
+        buffer = io.BytesIO()
+        np.savez(buffer, **dict(arrays))
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            atomic_write(self.ledger.model_arrays, buffer.getvalue())
+            atomic_write(self.ledger.model_description, json.dumps(description, indent=1).encode())
+
+
+@contextlib.contextmanager
+def _clear_errors(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        _refuse(folder, error)
+
+
+def _refuse(folder: Path, error: OSError) -> NoReturn:
+    what = {
+        errno.ENOSPC: "the disk is full",
+        errno.EDQUOT: "the disk quota is used up",
+        errno.EROFS: "the file system is read-only",
+        errno.EACCES: "permission denied",
+        errno.ENOTDIR: "a part of the path is a file",
+        errno.EEXIST: "a file of that name is in the way",
+    }.get(error.errno or 0, error.strerror or str(error))
+    raise LedgerError(
+        f"cannot write to the run folder {folder}: {what}. What was committed is intact; "
+        "once the cause is gone, --resume continues"
+    ) from error
+
+
+# ---- the lock -------------------------------------------------------------------------------------------------------
+
+
+def _this_process() -> dict[str, Any]:
+    def read(path: str) -> str:
+        try:
+            return Path(path).read_text().strip()
+        except OSError:
+            return ""
+
+    try:
+        pid_namespace = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        pid_namespace = ""
+    return {
+        "host": socket.gethostname(),
+        "boot_id": read("/proc/sys/kernel/random/boot_id"),
+        "pid_namespace": pid_namespace,
+        "pid": os.getpid(),
+        "started": psutil.Process().create_time(),
+    }
+
+
+def _believed_alive(owner: Mapping[str, Any]) -> bool:
+    """Look the owner up where its processes can be seen from here; else believe its last heartbeat for a lease."""
+    if not owner or owner.get("released"):
+        return False
+    here = _this_process()
+    same_kernel = here["boot_id"] and owner.get("boot_id") == here["boot_id"]
+    if same_kernel and owner.get("pid_namespace") == here["pid_namespace"]:
+        try:
+            process = psutil.Process(int(owner["pid"]))
+            return bool(
+                abs(process.create_time() - float(owner["started"])) < 1.0 and process.status() != psutil.STATUS_ZOMBIE
+            )
+        except (psutil.NoSuchProcess, KeyError, ValueError, TypeError):
+            return False
+    try:
+        return time.time() - float(owner["heartbeat"]) < LEASE_SECONDS
+    except (KeyError, ValueError, TypeError):
+        return False
+
+
+class _Lock:
+    """Ownership of a run, in a file whose every reading and writing happens under `flock`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._me = _this_process()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @contextlib.contextmanager
+    def _locked_file(self) -> Iterator[io.BufferedRandom]:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        with os.fdopen(descriptor, "r+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield file
+
+    def _read(self, file: io.BufferedRandom) -> dict[str, Any]:
+        file.seek(0)
+        try:
+            owner = json.loads(file.read(_MAX_STATUS_BYTES) or b"{}")
+        except ValueError:
+            return {}
+        return owner if isinstance(owner, dict) else {}
+
+    def _write(self, file: io.BufferedRandom, **extra: Any) -> None:
+        content = json.dumps({**self._me, "heartbeat": time.time(), **extra}).encode()
+        file.seek(0)
+        file.write(content)
+        file.truncate()
+        file.flush()
+        os.fsync(file.fileno())
+
+    def _is_mine(self, owner: Mapping[str, Any]) -> bool:
+        return not owner.get("released") and all(owner.get(key) == value for key, value in self._me.items())
+
+    def acquire(self) -> None:
+        with self._locked_file() as file:
+            owner = self._read(file)
+            if _believed_alive(owner):
+                raise RunLockedError(
+                    f"{self._path.parent} is being worked on by process {owner.get('pid')} on {owner.get('host')}. "
+                    "Wait for it to end, or stop it; if it is on a machine that died, its claim ends "
+                    f"{LEASE_SECONDS:.0f} s after its last sign of life"
+                )
+            self._write(file)
+        self._thread = threading.Thread(target=self._beat, name="lock-heartbeat", daemon=True)
+        self._thread.start()
+
+    def _beat(self) -> None:
+        while not self._stop.wait(HEARTBEAT_SECONDS):
+            # A disk that is full for a moment must not end the thread: the next beat, or the commit, will tell.
+            with contextlib.suppress(OSError, RunLockedError), self.held():
+                pass
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Do something that only the owner may do. Raises RunLockedError if that is no longer us."""
+        with self._locked_file() as file:
+            owner = self._read(file)
+            if not self._is_mine(owner):
+                raise RunLockedError(
+                    f"{self._path.parent} was taken over by process {owner.get('pid')} on {owner.get('host')}; "
+                    "this process stops and changes nothing more"
+                )
+            self._write(file)
+            yield
+
+    def release(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            with contextlib.suppress(OSError), self._locked_file() as file:
+                if self._is_mine(self._read(file)):
+                    self._write(file, released=True)
