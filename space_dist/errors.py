@@ -33,6 +33,6 @@ class Interrupted(SpaceDistError):  # noqa: N818 - an interruption is an outcome
 
 
 def nearest(word: str, allowed: Iterable[str]) -> str:
-    """`"; did you mean 'eta'?"` where one of `allowed` resembles `word`, else an empty string."""
+    """`"; did you mean 'eta'?"` where one of `allowed` resembles `word`, else `"."`: the end of a clause."""
     close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return f"; did you mean {close[0]!r}?" if close else "."

@@ -1,0 +1,516 @@
+"""The schema of a run: one YAML file, checked to the last key, every field explained (`space-dist config schema`)."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import reprlib
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from space_dist.errors import ConfigError, nearest
+
+_MAX_CONFIG_BYTES = 1 << 20
+_MAX_NESTING = 50
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class EnvConfig(_Section):
+    """The environment."""
+
+    id: str = Field(min_length=1, max_length=300)
+    """Registered id (space_dist/PointMass-v0) or import path of a function that makes a batched environment
+    (my_package.my_module:make)."""
+    context_visible: bool = True
+    """Whether observations end with the context, scaled from its bounds to [-1, 1]. The released SPaCE code hides it;
+    value-based curricula need it where all episodes start alike."""
+
+
+class InstancesConfig(_Section):
+    """The instance sets."""
+
+    train: Path = Field(strict=False)
+    """CSV of the training instances (columns: id and the context's features, in environment units); a relative path is
+    relative to this config file."""
+    test: Path = Field(strict=False)
+    """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
+
+
+class SpaceConfig(_Section):
+    """SPaCE (Eimer et al. 2021, Algorithm 1)."""
+
+    kind: Literal["space"]
+    """Which curriculum: SPaCE."""
+    eta: float = Field(default=0.1, gt=0.0)
+    """Growth threshold: the set grows when the mean start value changed by at most this share. Source: the authors' run
+    scripts use 0.1, section 5.6 recommends 0.05, appendix A (CartPole) uses 0.025."""
+    kappa: int = Field(default=1, ge=1)
+    """Instances added per growth. Source: section 5.6 recommends 1."""
+    allow_context_blind: bool = False
+    """Run even though the policy cannot tell instances apart at their start (the released code's PointMass): all values
+    tie, and the order is a random one."""
+
+
+class RandomGrowthConfig(_Section):
+    """Control: grows exactly like SPaCE, but which instances are in the set is random."""
+
+    kind: Literal["random_growth"]
+    """Which curriculum: random growth."""
+    eta: float = Field(default=0.1, gt=0.0)
+    """Growth threshold, as SPaCE's."""
+    kappa: int = Field(default=1, ge=1)
+    """Instances added per growth, as SPaCE's."""
+
+
+class RoundRobinConfig(_Section):
+    """All instances in turn, in a random order fixed by the seed (the paper's first baseline, section 5.2)."""
+
+    kind: Literal["round_robin"]
+    """Which curriculum: round robin."""
+
+
+CurriculumConfig = Annotated[SpaceConfig | RoundRobinConfig | RandomGrowthConfig, Field(discriminator="kind")]
+
+
+class _OnPolicy(_Section):
+    n_steps: int = Field(default=2048, ge=2)
+    """Environment transitions per update, over all shards and slots; the same constant for every curriculum. Source:
+    SB3's PPO (2048); sb3-contrib's TRPO and the released SPaCE code on PointMass differ (2048 and 1024)."""
+    learning_rate: float = Field(default=3e-4, gt=0.0)
+    """Step size of Adam. Source: SB3's PPO (3e-4); for TRPO it is the critic's, sb3-contrib has 1e-3."""
+    learning_rate_schedule: Literal["constant", "linear"] = "constant"
+    """`linear` falls to 0 at the end of the budget."""
+    batch_size: int = Field(default=64, ge=2)
+    """Transitions per minibatch. Source: SB3's PPO (64); sb3-contrib's TRPO has 128."""
+    gamma: float = Field(default=0.95, ge=0.0, le=1.0)
+    """Discount per step. Source: the paper, appendix A (0.95)."""
+    gae_lambda: float = Field(default=0.99, ge=0.0, le=1.0)
+    """Lambda of generalised advantage estimation. Source: the paper, appendix A (0.99)."""
+    normalize_advantage: bool = True
+    """Scale advantages to mean 0 and standard deviation 1 per minibatch. Source: SB3."""
+    net_arch: tuple[Annotated[int, Field(ge=1, le=16384)], ...] = Field(default=(64, 64), max_length=16, strict=False)
+    """Units of each hidden layer, for actor and critic each. Source: the paper, appendix A (two layers of 64)."""
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Activation of the hidden layers. Source: SB3."""
+    log_std_init: float = 0.0
+    """Natural logarithm of the initial standard deviation of continuous actions, in action units. Source: SB3."""
+
+
+class PPOConfig(_OnPolicy):
+    """Stable-Baselines3 PPO."""
+
+    kind: Literal["ppo"]
+    """Which learner: PPO."""
+    n_epochs: int = Field(default=10, ge=1)
+    """Passes over each update's transitions. Source: SB3 (10); the paper's PPO2 default is 4."""
+    clip_range: float = Field(default=0.2, gt=0.0)
+    """Clipping of the probability ratio. Source: SB3."""
+    ent_coef: float = Field(default=0.0, ge=0.0)
+    """Weight of the entropy bonus. Source: the paper, appendix A (0)."""
+    vf_coef: float = Field(default=0.5, ge=0.0)
+    """Weight of the value loss. Source: SB3 (0.5); the reference for the paper's learners has 1."""
+    max_grad_norm: float | None = Field(default=0.5, gt=0.0)
+    """Largest norm of the gradient; null: no clipping (the paper, appendix A). Source of the default: SB3."""
+    target_kl: float | None = Field(default=None, gt=0.0)
+    """Stop an update's epochs early at 1.5 times this divergence; null: never. Source: SB3."""
+
+
+class TRPOConfig(_OnPolicy):
+    """sb3-contrib TRPO."""
+
+    kind: Literal["trpo"]
+    """Which learner: TRPO."""
+    learning_rate: float = Field(default=1e-3, gt=0.0)
+    """Step size of the critic's Adam. Source: sb3-contrib (1e-3); the paper's old library: about 0.24 (appendix A)."""
+    batch_size: int = Field(default=128, ge=2)
+    """Transitions per minibatch of the critic. Source: sb3-contrib."""
+    target_kl: float = Field(default=0.004, gt=0.0)
+    """Largest KL divergence of one policy step. Source: the paper, appendix A (0.004); sb3-contrib has 0.01."""
+    n_critic_updates: int = Field(default=10, ge=1)
+    """Passes of the critic over each update's transitions. Source: sb3-contrib (10); the paper's old library: 3."""
+    cg_max_steps: int = Field(default=15, ge=1)
+    """Conjugate gradient steps. Source: sb3-contrib (15); the paper's old library: 10."""
+    cg_damping: float = Field(default=0.1, ge=0.0)
+    """Damping of the Hessian-vector product. Source: sb3-contrib (0.1); the paper's old library: 0.01."""
+    line_search_shrinking_factor: float = Field(default=0.8, gt=0.0, lt=1.0)
+    """Factor by which a rejected policy step is shortened. Source: sb3-contrib."""
+    line_search_max_iter: int = Field(default=10, ge=1)
+    """Shortened steps tried before an update is given up. Source: sb3-contrib."""
+
+
+LearnerConfig = Annotated[PPOConfig | TRPOConfig, Field(discriminator="kind")]
+
+
+class RolloutConfig(_Section):
+    """How transitions are collected. All of it decides results; how many workers share the shards does not."""
+
+    shards: int = Field(default=4, ge=1, le=4096)
+    """Independent parts of a round; at most this many workers can share it."""
+    slots: int = Field(default=4, ge=1, le=65536)
+    """Environments stepped together in a shard. shards * slots must divide learner.n_steps, and
+    n_steps / (shards * slots) must be at least the environment's horizon."""
+    passes: float = Field(default=1.0, gt=0.0)
+    """Length of an iteration: as many updates as cover this many passes over the selected instances at full horizon."""
+    start_states: int = Field(default=1, ge=1, le=1000)
+    """Seeded start observations per instance whose mean value is its start value. One is exact where episodes start in
+    one state (PointMass)."""
+
+
+class BudgetConfig(_Section):
+    """How long a run is."""
+
+    steps: int = Field(ge=1, le=10**12)
+    """Real environment steps of training, warm-up and probes included. A run makes as many whole updates as fit."""
+
+
+class EvaluationConfig(_Section):
+    """Deterministic evaluation on every training and test instance, on environments and seeds of its own."""
+
+    every_steps: int | Literal["log"] = Field(default=10_000)
+    """Environment steps between evaluations; log: at 1e3, 3e3, 1e4, 3e4, ... Step 0 and the end are always evaluated."""
+    episodes: int = Field(default=1, ge=1, le=1000)
+    """Episodes per instance and evaluation, with the same seeds each time."""
+
+    @field_validator("every_steps")
+    @classmethod
+    def _positive(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and value < 1:
+            raise ValueError("must be at least 1, or log")
+        return value
+
+
+class CheckpointConfig(_Section):
+    """When the run makes its progress permanent; it does so too when asked to stop. Decides no result."""
+
+    every_rounds: int = Field(default=20, ge=1)
+    """Updates between checkpoints, at most."""
+    every_seconds: float = Field(default=60.0, gt=0.0)
+    """Seconds between checkpoints, at most (and at least one update)."""
+
+
+class TrackingConfig(_Section):
+    """Where MLflow keeps its mirror of the run. Decides no result."""
+
+    uri: str | None = Field(default="sqlite:///mlflow.db", max_length=2000)
+    """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; null: none."""
+    experiment: str = Field(default="space_dist", min_length=1, max_length=200)
+    """MLflow experiment."""
+    live: bool = True
+    """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
+
+
+class ResourcesConfig(_Section):
+    """What the run may use. Decides no result."""
+
+    workers: int = Field(default=1, ge=0, le=4096)
+    """Ray rollout actors; 0: everything in this process, without Ray."""
+    address: str = Field(default="local", min_length=1, max_length=300)
+    """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
+    grace_seconds: float = Field(default=25.0, gt=0.0)
+    """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
+
+
+class RunConfig(_Section):
+    """One run."""
+
+    name: str = Field(pattern=_NAME)
+    """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
+    seed: int = Field(default=0, ge=0, le=2**31 - 1)
+    """The one number from which every random number of the run comes."""
+    env: EnvConfig
+    instances: InstancesConfig
+    curriculum: CurriculumConfig
+    learner: LearnerConfig
+    rollout: RolloutConfig = RolloutConfig()
+    budget: BudgetConfig
+    evaluation: EvaluationConfig = EvaluationConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    resources: ResourcesConfig = ResourcesConfig()
+
+    @model_validator(mode="after")
+    def _whole_slots(self) -> Self:
+        per_step = self.rollout.shards * self.rollout.slots
+        if self.learner.n_steps % per_step:
+            raise ValueError(
+                f"learner.n_steps = {self.learner.n_steps} is not a multiple of rollout.shards * rollout.slots = "
+                f"{self.rollout.shards} * {self.rollout.slots} = {per_step}"
+            )
+        if self.budget.steps < self.learner.n_steps:
+            raise ValueError(
+                f"budget.steps = {self.budget.steps} is less than one update of learner.n_steps = {self.learner.n_steps}"
+            )
+        return self
+
+    @property
+    def slot_length(self) -> int:
+        """Transitions per slot and round."""
+        return self.learner.n_steps // (self.rollout.shards * self.rollout.slots)
+
+    @property
+    def rounds(self) -> int:
+        """Updates in the whole run."""
+        return self.budget.steps // self.learner.n_steps
+
+
+NOT_IDENTITY = ("checkpoint", "tracking", "resources")  # sections that cannot change a result
+
+
+def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
+    """Read a config file, apply `a.b=c` overrides and the seed, and check everything.
+
+    Relative instance paths become absolute, from the config's folder (from the current one in an override).
+    Raises ConfigError with the file and key of every fault.
+    """
+    data = _read_yaml(path)
+    instances = data.get("instances")
+    if isinstance(instances, dict):
+        folder = path.absolute().parent
+        data["instances"] = {
+            key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()
+        }
+    for override in overrides:
+        _apply(data, override)
+    if seed is not None:
+        data["seed"] = seed
+    origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}
+    return parse(data, str(path), origins)
+
+
+def parse(data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> RunConfig:
+    """Check plain data against the schema. `origins` says which keys came from elsewhere than `source`."""
+    try:
+        return RunConfig.model_validate(data)
+    except ValidationError as error:
+        faults = [_explain(fault, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
+        raise ConfigError("\n".join(dict.fromkeys(faults))) from None
+
+
+def dump(config: RunConfig) -> str:
+    """The resolved config as YAML, every default written out."""
+    return to_yaml(config.model_dump(mode="json"))
+
+
+def identity(config: RunConfig, train_digest: str, test_digest: str) -> str:
+    """`(64 hex digits)` a hash of everything that decides the run's results, instance files by their content."""
+    data = config.model_dump(mode="json", exclude=set(NOT_IDENTITY))
+    data["instances"] = {"train": train_digest, "test": test_digest}
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def differences(one: RunConfig, other: RunConfig) -> list[str]:
+    """`key: value -> value` for every key that decides results and differs; instance paths are left out."""
+    exclude = {*NOT_IDENTITY, "instances"}
+    left = dict(_flatten(one.model_dump(mode="json", exclude=exclude)))
+    right = dict(_flatten(other.model_dump(mode="json", exclude=exclude)))
+    return [f"{key}: {left.get(key)} -> {right.get(key)}" for key in sorted({*left, *right})
+            if left.get(key) != right.get(key)]  # fmt: skip
+
+
+def schema() -> Iterator[tuple[str, str, str, str]]:
+    """(key, type, default, explanation) of every field, in order."""
+    yield from _describe(RunConfig, "")
+
+
+def _flatten(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def to_yaml(data: Mapping[str, Any]) -> str:
+    """Plain data as YAML text."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    buffer = io.StringIO()
+    yaml.dump(dict(data), buffer)
+    return buffer.getvalue()
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        if path.is_dir():
+            raise ConfigError(f"{path} is a folder; a config is a YAML file")
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path} is not a regular file")
+        with path.open("rb") as file:
+            content = file.read(_MAX_CONFIG_BYTES + 1)
+    except FileNotFoundError:
+        folder = path.parent
+        siblings = [str(file) for file in folder.glob("*.yaml")] if folder.is_dir() else []
+        raise ConfigError(f"{path} does not exist{nearest(str(path), siblings)}") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(content) > _MAX_CONFIG_BYTES:
+        raise ConfigError(f"{path} is larger than {_MAX_CONFIG_BYTES >> 20} MiB: that is no config")
+    data = _parse_yaml(content, str(path))
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} must hold keys and values, like `name: my_run`; it holds {_short(data)}")
+    return data
+
+
+def _parse_yaml(content: bytes | str, source: str) -> Any:
+    try:
+        text = content.decode() if isinstance(content, bytes) else content
+        yaml = YAML(typ="safe", pure=True)
+        yaml.allow_duplicate_keys = False
+        return _plain(yaml.load(text))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{source} is not UTF-8 text (byte {error.start})") from None
+    except DuplicateKeyError as error:
+        where = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        problem = str(error.problem).split(" with value")[0]
+        raise ConfigError(f"{source}{where}: {problem}: every key may stand once") from None
+    except YAMLError as error:
+        mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
+        where = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else str(error)
+        raise ConfigError(f"{source}{where} is not valid YAML: {str(problem).splitlines()[0][:200]}") from None
+    except RecursionError:
+        raise ConfigError(f"{source} is nested too deeply") from None
+    except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, NotImplementedError) as error:
+        raise ConfigError(f"{source} is not valid YAML: {str(error)[:200]}") from None
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    """Only what JSON knows, so that dates, sets and self-containing aliases cannot surprise anyone later."""
+    if depth > _MAX_NESTING:
+        raise RecursionError
+    if isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                raise ValueError(f"the key {_short(key)} is not a word")  # noqa: TRY004 - a fault of the file
+        return {str(key): _plain(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list):
+        if len(value) > 10_000:
+            raise ValueError(f"a list of {len(value)} values")
+        return [_plain(item, depth + 1) for item in value]
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return int(value) if math.isfinite(value) and value.is_integer() else value  # 1e6 is how people write counts
+    raise ValueError(f"{_short(value)} is a {type(value).__name__}; write numbers, words, lists and keys only")
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
+    value = _parse_yaml(text, f"--set {override}")
+    if parts[0] == "instances" and isinstance(value, str):
+        value = str(Path(value).absolute())
+    section: Any = data
+    for part in parts[:-1]:
+        section = section.setdefault(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"--set {override}: {part!r} is not a section")
+    section[parts[-1]] = value
+
+
+def _explain(fault: Any, source: str, origins: Mapping[str, str]) -> str:
+    path, model = _locate(fault["loc"])
+    if fault["type"].startswith("union_tag"):
+        path.append("kind")
+    key = ".".join(path)
+    where = next((origin for name, origin in origins.items() if key == name or key.startswith(f"{name}.")), source)
+    kind, given = fault["type"], fault.get("input")
+    context = fault.get("ctx", {})
+    if kind == "extra_forbidden":
+        allowed = list(model.model_fields) if model else []
+        return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
+    if kind == "missing":
+        return f"{where}: {key}: this key is required"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        tags = [tag.strip("' ") for tag in str(context.get("expected_tags") or _tags(path[0])).split(",")]
+        given_kind = given.get("kind") if isinstance(given, dict) else given
+        hint = nearest(str(given_kind), tags) if given_kind is not None else "."
+        return f"{where}: {key}: {_short(given_kind)} is not known{hint} Allowed: {', '.join(tags)}"
+    if kind == "value_error":
+        message = str(context.get("error", fault["msg"]))
+        return f"{where}: {key}: {message}, not {_short(given)}" if key else f"{where}: {message}"
+    return f"{where}: {key or 'the whole file'}: {_short(given)}: {fault['msg']}"
+
+
+def _tags(key: str) -> str:
+    return ", ".join(
+        str(get_args(option.model_fields["kind"].annotation)[0]) for option in _models(RunConfig.model_fields[key])
+    )
+
+
+def _locate(location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel] | None]:
+    """Pydantic's location without the tags of unions, and the section it lies in."""
+    path: list[str] = []
+    model: type[BaseModel] | None = RunConfig
+    options: list[type[BaseModel]] = []
+    for part in location:
+        tagged = [option for option in options if get_args(option.model_fields["kind"].annotation)[0] == part]
+        if tagged:
+            model, options = tagged[0], []
+            continue
+        if isinstance(part, str) and model is None:
+            continue  # the name pydantic gives to one alternative of a value, like int or literal['log']
+        path.append(str(part))
+        field = model.model_fields.get(str(part)) if model else None
+        inner = _models(field) if field else []
+        if field is not None and part != location[-1]:
+            model = inner[0] if len(inner) == 1 else None
+            options = inner if len(inner) > 1 else []
+    return path, model
+
+
+def _models(field: Any) -> list[type[BaseModel]]:
+    annotations = (
+        get_args(field.annotation)
+        if get_origin(field.annotation) in (Union, types.UnionType)
+        else [field.annotation]
+    )
+    return [annotation for annotation in annotations
+            if isinstance(annotation, type) and issubclass(annotation, BaseModel)]  # fmt: skip
+
+
+def _describe(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str, str, str]]:
+    for name, field in model.model_fields.items():
+        key, inner = f"{prefix}{name}", _models(field)
+        if not inner:
+            default = "required" if field.is_required() else json.dumps(field.get_default(), default=str)
+            yield key, _type_name(field), default, " ".join((field.description or "").split())
+        for section in inner:
+            tag = f" ({section.model_fields['kind'].annotation.__args__[0]})" if len(inner) > 1 else ""  # type: ignore[union-attr]
+            yield f"{key}{tag}", "section", "", " ".join((section.__doc__ or "").split())
+            yield from _describe(section, f"{key}.")
+
+
+def _type_name(field: Any) -> str:
+    annotation = field.annotation
+    name = str(annotation) if get_origin(annotation) else annotation.__name__
+    name = name.replace("typing.", "").replace("NoneType", "null").replace("None", "null")
+    limits = [f"{symbol} {getattr(item, attribute)}" for item in field.metadata
+              for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
+              if hasattr(item, attribute)]  # fmt: skip
+    if name.startswith("tuple"):
+        name = "list of int"
+    return " ".join([name, *limits])
+
+
+def _short(value: object) -> str:
+    shortener = reprlib.Repr()
+    shortener.maxstring = shortener.maxother = 80
+    shortener.maxlevel = 2
+    return shortener.repr(value)

@@ -1,0 +1,129 @@
+"""SPaCE: Self-Paced Context Evaluation (Eimer et al., ICML 2021, Algorithm 1).
+
+`Space.step` is lines 6-13 of Algorithm 1, in order; line 5 (collect and update) is `training.py`. docs/algorithm.md
+maps the lines and names every place where the paper is silent or contradicts itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, State
+from space_dist.instances import InstanceSet
+from space_dist.seeding import Purpose, combine, instance_keys
+
+
+class Space:
+    """The instances whose start value rose most, from a set that grows whenever values settle.
+
+    eta: growth threshold: the relative change of the mean start value below which the set grows (paper: eta).
+    kappa: how many instances a growth adds (paper: kappa).
+    seed: decides the first instance and ties.
+    """
+
+    ranks_by_value = True
+
+    def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
+        self._instances, self._eta, self._kappa = instances, eta, kappa
+        self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
+        self._by_tie = np.argsort(self._ties, kind="stable")
+
+    def start(self) -> tuple[State, Selection]:
+        """Lines 1-3: one instance, chosen by the seed. Line 1's S := 0 would empty the set: S starts at 1."""
+        state = State(version=0, order_version=0, size=1, selected=self._by_tie[:1])
+        return state, self.selection(state)
+
+    def step(self, state: State, feedback: Feedback) -> tuple[State, Selection, Numbers]:
+        """Lines 6-13: compare values on the set just trained on, maybe grow, and select by PIC."""
+        n, trained = len(self._instances), state.selected
+        before, after = feedback.values_before, feedback.values_after
+
+        # Line 6: V_t := mean |V_t(s0, c_i)|. V_{t-1} is taken over the same instances, or the comparison in line 7
+        # would mix a change of values with a change of set.
+        mean_before = float(np.abs(before[trained]).mean())
+        mean_after = float(np.abs(after[trained]).mean())
+
+        # Lines 7-8: if V_t is within eta of V_{t-1}, grow. Without a gradient step nothing was learnt that could
+        # have settled.
+        tested = feedback.gradient_steps > 0
+        grew = tested and abs(mean_after - mean_before) <= self._eta * max(mean_before, 1e-8)
+        size = min(state.size + self._kappa, n) if grew else state.size
+
+        # Lines 10-11: d_t(i) := V_t(s0, c_i) - V_{t-1}(s0, c_i).
+        scores = self.scores(feedback)
+
+        # Line 12: I_curr := the S instances with the highest d_t(i), best first.
+        selected = _highest(scores, size, self._by_tie)
+
+        new = dataclasses.replace(
+            state,
+            version=state.version + 1,
+            order_version=state.order_version if np.array_equal(selected, trained) else state.version + 1,
+            size=size,
+            selected=selected,
+            tests=state.tests + tested,
+            growths=state.growths + grew,
+            stalled=0 if grew or size == n else state.stalled + tested,
+            mean_value=float(np.abs(after[selected]).mean()),
+        )
+        numbers: Numbers = {
+            "size": size,
+            "trained_size": len(trained),
+            "grew": grew,
+            "tests": new.tests,
+            "growths": new.growths,
+            "stalled": new.stalled,
+            "mean_value_before": mean_before,
+            "mean_value_after": mean_after,
+            "relative_change": _relative_change(mean_before, mean_after),
+            # Two other readings of lines 6-7 (docs/algorithm.md), logged so that they can be compared.
+            "relative_change_as_printed": _relative_change(state.mean_value, mean_after),
+            "relative_change_each": float(np.abs(after[trained] - before[trained]).mean()) / max(mean_before, 1e-8),
+            "largest_pic": float((after - before).max()),
+            "smallest_pic": float((after - before).min()),
+            "kept": int(np.isin(selected, trained).sum()),
+        }
+        return new, self.selection(new), numbers
+
+    def scores(self, feedback: Feedback) -> FloatArray:
+        """`(n,)` the performance improvement capacity d_t(i) of every instance (Definition 1), signed."""
+        return feedback.values_after - feedback.values_before
+
+    def selection(self, state: State) -> Selection:
+        """The instances a state has selected."""
+        return Selection(
+            version=state.version,
+            ids=self._instances.ids[state.selected],
+            contexts=self._instances.contexts[state.selected],
+            order_version=state.order_version,
+        )
+
+
+class RandomGrowth(Space):
+    """A control: the set grows exactly when SPaCE's rule says so, but *which* instances are in it is random."""
+
+    ranks_by_value = False
+
+    def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
+        super().__init__(instances, eta=eta, kappa=kappa, seed=seed)
+        self._random = instance_keys(seed, Purpose.RANDOM_GROWTH, instances.ids, instances.contexts)
+
+    def scores(self, feedback: Feedback) -> FloatArray:
+        """`(n,)` random numbers, drawn afresh for every decision."""
+        return combine(self._random, feedback.version).astype(np.float64)
+
+
+def _highest(scores: FloatArray, size: int, by_tie: IntArray) -> IntArray:
+    """`(size,)` indices of the highest scores, best first; equal scores stand in the order of `by_tie`."""
+    candidates = by_tie
+    if size < len(scores):  # sorting a million scores for the best hundred would cost more than the values themselves
+        threshold = np.partition(scores, len(scores) - size)[len(scores) - size]
+        candidates = by_tie[scores[by_tie] >= threshold]
+    return candidates[np.argsort(-scores[candidates], kind="stable")[:size]]
+
+
+def _relative_change(before: float | None, after: float) -> float | None:
+    """|after - before| as a share of `before`; None where there is no `before` yet."""
+    return None if before is None else abs(after - before) / max(before, 1e-8)

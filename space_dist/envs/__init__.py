@@ -1,0 +1,61 @@
+"""Contextual environments: batched for us, registered with Gymnasium for everyone else."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+
+from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
+from space_dist.envs.pointmass import BatchedPointMass
+from space_dist.envs.single import ContextObservation, SingleEnv
+from space_dist.errors import ConfigError, nearest
+
+BATCHED: dict[str, Callable[[int], BatchedEnv]] = {"space_dist/PointMass-v0": BatchedPointMass}
+
+
+def make_single(env_id: str) -> SingleEnv:
+    """The Gymnasium environment behind a registered id."""
+    return SingleEnv(BATCHED[env_id])
+
+
+for _id in BATCHED:
+    if _id not in gym.registry:
+        gym.register(id=_id, entry_point="space_dist.envs:make_single", kwargs={"env_id": _id}, order_enforce=True)
+
+
+def make_batched(env_id: str, n_slots: int, *, context_visible: bool) -> BatchedEnv:
+    """Build a batched environment by registered id or by import path (`my_package.my_module:make`).
+
+    A function at an import path is called with the number of slots and returns a `BatchedEnv`.
+    Raises ConfigError if there is no such environment.
+    """
+    env = _find(env_id)(n_slots)
+    missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
+               if not hasattr(env, name)]  # fmt: skip
+    if missing:
+        raise ConfigError(f"env.id {env_id!r} made a {type(env).__name__} without {', '.join(missing)}")
+    return ContextVisible(env) if context_visible else env
+
+
+def _find(env_id: str) -> Callable[[int], Any]:
+    if env_id in BATCHED:
+        return BATCHED[env_id]
+    module_name, colon, name = env_id.partition(":")
+    if not colon:
+        raise ConfigError(
+            f"env.id {env_id!r} is not known{nearest(env_id, BATCHED)} Known: {', '.join(BATCHED)}, "
+            "or an import path like my_package.my_module:make"
+        )
+    try:
+        found = getattr(importlib.import_module(module_name), name, None)
+    except (ImportError, SyntaxError, ValueError) as error:
+        raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {error}") from None
+    if not callable(found):
+        raise ConfigError(f"env.id {env_id!r}: {module_name!r} has no function {name!r}")
+    return found  # type: ignore[no-any-return]
+
+
+__all__ = ["BatchedEnv", "BatchedPointMass", "ContextObservation", "ContextVisible", "SingleEnv", "Step", "make_batched"]

@@ -1,0 +1,104 @@
+"""PointMass (Klink et al. 2020): steer a point through a gate in a wall to a goal behind it.
+
+Facts: ../shared/reference/algorithm.md ("PointMass"); Klink et al., "Self-Paced Deep Reinforcement Learning", 2020.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
+from space_dist.instances import POINTMASS_BOUNDS
+
+DT = 0.01  # seconds per inner step
+INNER_STEPS = 10  # physics steps per action
+FORCE = 1.5  # acceleration per unit of action
+NOISE_STD = 0.05  # of the acceleration, per inner step and axis
+ACTION_LIMIT = 10.0
+POSITION_LIMIT = 4.0
+START = np.array([0.0, 0.0, 3.0, 0.0])  # x, vx, y, vy
+GOAL = np.array([0.0, -3.0])
+SUCCESS_DISTANCE = 0.25
+REWARD_DECAY = 0.6  # per unit of distance to the goal
+HORIZON = 100
+
+
+class BatchedPointMass:
+    """`n_slots` point masses. Context: (gate_x, gate_width, friction).
+
+    State per slot: (x, vx, y, vy) in float64; observed as float32. An episode's noise is drawn from its seed, all
+    (horizon, inner steps, 2) numbers at once, so that it depends on nothing but the seed.
+    """
+
+    def __init__(self, n_slots: int, *, horizon: int = HORIZON) -> None:
+        self.n_slots, self.horizon = n_slots, horizon
+        limit = np.array([POSITION_LIMIT, np.inf, POSITION_LIMIT, np.inf], dtype=np.float32)
+        self.observation_space = spaces.Box(-limit, limit, dtype=np.float32)
+        self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, shape=(2,), dtype=np.float32)
+        self.context_bounds = POINTMASS_BOUNDS
+        self._position = np.zeros((2, n_slots))  # x and y
+        self._velocity = np.zeros((2, n_slots))
+        self._context = np.zeros((3, n_slots))
+        self._time = np.zeros(n_slots, dtype=np.int64)
+        self._seeds = np.zeros(n_slots, dtype=np.uint64)
+        self._noise = np.zeros((n_slots, horizon, INNER_STEPS, 2))
+
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
+        """Start new episodes at (0, 3), at rest."""
+        self._position[:, slots] = START[[0, 2], None]
+        self._velocity[:, slots] = START[[1, 3], None]
+        self._context[:, slots] = contexts.T
+        self._time[slots] = 0
+        self._seeds[slots] = seeds
+        return self._observe()[slots]
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        """Ten inner Euler steps. Crossing y = 0 outside the gate puts the mass at the wall and ends the episode."""
+        for slot in np.flatnonzero(self._time == 0):  # not in reset: who only wants start states pays for no noise
+            np.random.default_rng(int(self._seeds[slot])).standard_normal(out=self._noise[slot])
+        gate_x, gate_width, friction = self._context
+        force = FORCE * np.clip(actions.T.astype(np.float64), -ACTION_LIMIT, ACTION_LIMIT)
+        noise = self._noise[np.arange(self.n_slots), np.minimum(self._time, self.horizon - 1)]
+        drive = DT * (force + NOISE_STD * noise.transpose(1, 2, 0))  # (inner steps, 2, n_slots)
+        decay = 1.0 - DT * friction
+        path = np.empty((INNER_STEPS + 1, 2, self.n_slots))
+        path[0], velocity = self._position, self._velocity
+        for inner in range(INNER_STEPS):
+            position = path[inner] + DT * velocity
+            np.minimum(position, POSITION_LIMIT, out=position)
+            np.maximum(position, -POSITION_LIMIT, out=path[inner + 1])
+            velocity = velocity * decay + drive[inner]
+        self._position, self._velocity = path[-1].copy(), velocity
+        crashed = self._hit_wall(path, gate_x, gate_width)
+        self._time += 1
+        distance = np.hypot(self._position[0] - GOAL[0], self._position[1] - GOAL[1])
+        return Step(
+            observations=self._observe(),
+            rewards=np.exp(-REWARD_DECAY * distance),
+            terminated=crashed,
+            truncated=(self._time >= self.horizon) & ~crashed,
+            success=distance < SUCCESS_DISTANCE,
+        )
+
+    def _hit_wall(self, path: FloatArray, gate_x: FloatArray, gate_width: FloatArray) -> NDArray[np.bool_]:
+        """Which slots crossed y = 0 outside their gate on `path` (inner steps + 1, 2, n_slots); they end at the wall."""
+        y_before, y_after = path[:-1, 1], path[1:, 1]
+        crossed = (y_before * y_after <= 0.0) & (y_before != y_after)
+        crashed = np.zeros(self.n_slots, dtype=np.bool_)
+        for slot in np.flatnonzero(crossed.any(axis=0)):
+            for inner in np.flatnonzero(crossed[:, slot]):
+                (x0, y0), (x1, y1) = path[inner, :, slot], path[inner + 1, :, slot]
+                wall_x = x0 + y0 / (y0 - y1) * (x1 - x0)
+                if abs(wall_x - gate_x[slot]) > gate_width[slot] / 2:
+                    crashed[slot] = True
+                    self._position[:, slot] = wall_x, 0.0
+                    self._velocity[:, slot] = 0.0
+                    break
+        return crashed
+
+    def _observe(self) -> Observations:
+        x, y = self._position
+        vx, vy = self._velocity
+        return np.stack([x, vx, y, vy], axis=1).astype(np.float32)

@@ -1,0 +1,472 @@
+"""Instance sets: which contexts a run trains and is tested on. Read, checked, written and sampled here.
+
+An *instance* is one context (a feature vector) with an id. Sets live in CSV files, one instance a line: `id` and one
+column a feature. A file is checked whole before a run starts, because a bad row found after hours costs those hours.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import stat
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from space_dist.errors import ConfigError, nearest
+from space_dist.seeding import Purpose, generator
+
+MAX_FILE_BYTES: Final = 512 * 2**20
+MAX_LINE_BYTES: Final = 2**20  # some 40,000 features; a file without line ends never gets into memory whole
+MAX_INSTANCES: Final = 10_000_000
+MAX_ID: Final = 2**63 - 1
+MAX_REDRAWS: Final = 100
+
+
+@dataclass(frozen=True, eq=False)
+class ContextBounds:
+    """The features of an environment's contexts and the closed interval each may lie in, in the environment's units.
+
+    `names` are the d features, `low` and `high` are `(d,)`. Raises ConfigError unless the names are distinct, can
+    stand in a CSV header as they are, and low < high, both finite.
+    """
+
+    names: tuple[str, ...]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        _check_names(self.names)
+        low, high = (np.array(side, dtype=np.float64) + 0.0 for side in (self.low, self.high))
+        if low.shape != (len(self.names),) or high.shape != low.shape:
+            raise ConfigError(f"bounds of shapes {low.shape} and {high.shape} for {len(self.names)} features")
+        with np.errstate(over="ignore", invalid="ignore"):
+            usable = np.isfinite(high - low) & (low < high)
+        if not usable.all():
+            bad = int(np.argmin(usable))
+            raise ConfigError(f"feature {_shown(self.names[bad])} has bounds [{low[bad]}, {high[bad]}]: "
+                              "they must be finite, the lower below the higher")
+        _freeze(self, low=low, high=high)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ContextBounds):
+            return NotImplemented
+        return (self.names == other.names and np.array_equal(self.low, other.low)
+                and np.array_equal(self.high, other.high))
+
+    def __hash__(self) -> int:
+        return hash((self.names, self.low.tobytes(), self.high.tobytes()))
+
+    def scale(self, contexts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`(..., d)` contexts with the bounds moved to [-1, 1]; a context outside the bounds stays outside.
+
+        Raises ConfigError if the last axis is not d long.
+        """
+        if contexts.shape[-1:] != self.low.shape:  # a last axis of 1 would broadcast without a word
+            raise ConfigError(f"contexts of shape {contexts.shape} for the {len(self.names)} features of these bounds")
+        scaled: NDArray[np.float64] = 2.0 * ((contexts - self.low) / (self.high - self.low)) - 1.0
+        return scaled
+
+
+@dataclass(frozen=True, eq=False)
+class InstanceSet:
+    """At least one instance, sorted by id, so that the order of a file's rows can decide nothing.
+
+    `ids` are `(n,)` int64, ascending, unique and >= 0; `contexts` `(n, d)` float64 in the order of `ids`, without
+    negative zeros; `names` the d features. Both arrays are copies and read-only. Raises ConfigError for anything else.
+    """
+
+    ids: NDArray[np.int64]
+    contexts: NDArray[np.float64]
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        _check_names(self.names)
+        given = np.asarray(self.ids)
+        contexts = np.asarray(self.contexts, dtype=np.float64)
+        if contexts.ndim != 2 or given.shape != contexts.shape[:1] or contexts.shape[1] != len(self.names):
+            raise ConfigError(f"ids of shape {given.shape}, contexts of shape {contexts.shape} and {len(self.names)} "
+                              "feature names do not make an instance set")
+        if not len(given):
+            raise ConfigError("an instance set needs at least one instance")
+        if not np.issubdtype(given.dtype, np.integer):
+            raise ConfigError(f"ids must be whole numbers, not {given.dtype}")
+        if given.min() < 0 or given.max() > MAX_ID:
+            raise ConfigError(f"ids must be between 0 and {MAX_ID}, not {given.min()} to {given.max()}")
+        if not np.isfinite(contexts).all():
+            row, feature = np.argwhere(~np.isfinite(contexts))[0]
+            raise ConfigError(f"instance {given[row]} has {_shown(self.names[feature])} = {contexts[row, feature]}: "
+                              "contexts must be finite")
+        order = np.argsort(given, kind="stable")
+        ids = given[order].astype(np.int64)
+        if (repeated := np.flatnonzero(ids[1:] == ids[:-1])).size:
+            raise ConfigError(f"two instances have the id {ids[repeated[0]]}")
+        # + 0.0 turns -0.0 into 0.0: equal contexts shall have equal bytes, and so equal digests
+        _freeze(self, ids=ids, contexts=contexts[order] + 0.0)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, InstanceSet):
+            return NotImplemented
+        return (self.names == other.names and np.array_equal(self.ids, other.ids)
+                and np.array_equal(self.contexts, other.contexts))
+
+    def __hash__(self) -> int:
+        return hash((self.names, self.ids.tobytes(), self.contexts.tobytes()))
+
+    def to_csv(self) -> str:
+        r"""The one canonical text of this set: `id,<names>`, rows by id, shortest round-trip floats, `\n` ends."""
+        rows = zip(self.ids.tolist(), self.contexts.tolist(), strict=True)
+        lines = [",".join((str(identity), *map(repr, context))) for identity, context in rows]
+        return "\n".join((",".join(("id", *self.names)), *lines, ""))
+
+    def digest(self) -> str:
+        """SHA-256, in hex, of the canonical text in UTF-8: equal for equal sets whatever file they came from."""
+        return hashlib.sha256(self.to_csv().encode()).hexdigest()
+
+    def subset(self, indices: NDArray[np.int64] | Sequence[int]) -> InstanceSet:
+        """The instances at `(k,)` distinct positions (not ids, not a mask).
+
+        Raises ConfigError if a position is doubled or no whole number, or none is given; IndexError if it does not
+        exist.
+        """
+        chosen = np.asarray(indices)
+        if not np.issubdtype(chosen.dtype, np.integer):
+            raise ConfigError(f"a subset is chosen by at least one position, a whole number, not by {chosen.dtype}")
+        return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names)
+
+
+def read_csv(path: Path, bounds: ContextBounds) -> InstanceSet:
+    r"""The instances of a CSV file, checked whole.
+
+    The first line names `id` and exactly the features of `bounds`, in any order; each further line is one instance.
+    Cells are separated by commas; spaces around a cell, double quotes around a cell, a byte order mark, `\r\n` and
+    blank lines at the end are accepted. Features come back in the order of `bounds`.
+
+    Raises ConfigError, naming the file and where it can the row (the line as an editor numbers it) and the column,
+    if the file cannot be read or is larger than 512 MiB, if ids are not whole numbers from 0 to 2**63 - 1, if a
+    feature is not a number within its bounds, or if an id or a context occurs twice.
+    """
+    try:
+        _check_kind_and_size(path)
+        with path.open("rb") as file:
+            columns = _read_header(file, bounds)
+            ids, contexts = _read_rows(file, columns, bounds)
+        _refuse_repeats(ids, contexts)
+        return InstanceSet(ids, contexts, bounds.names)
+    except ConfigError as fault:
+        raise ConfigError(f"{_shown_path(path)}: {fault}") from None
+    except OSError as error:
+        raise ConfigError(f"{_shown_path(path)}: cannot be read: {error.strerror}") from error
+
+
+def refuse_overlap(train: InstanceSet, test: InstanceSet, train_name: str, test_name: str) -> None:
+    """Raise ConfigError if a context (compared by content, not by id) is in both sets, with the ids it has in each.
+
+    Also raised if the sets have different features: then nothing could be compared.
+    """
+    if train.names != test.names:
+        raise ConfigError(f"{train_name} and {test_name} have different features: "
+                          f"{_cut(', '.join(train.names), 120)} and {_cut(', '.join(test.names), 120)}")
+    first, second = _repeats(np.vstack((train.contexts, test.contexts)))
+    crossing = (first < len(train)) & (second >= len(train))
+    if crossing.any():
+        train_ids, test_ids = train.ids[first[crossing]], test.ids[second[crossing] - len(train)]
+        pairs = [f"id {a} of {train_name} is id {b} of {test_name}"
+                 for a, b in zip(train_ids[:3].tolist(), test_ids[:3].tolist(), strict=True)]
+        more = f" and {len(train_ids) - 3} more" if len(train_ids) > 3 else ""
+        raise ConfigError(f"training and test instances overlap: {', '.join(pairs)}{more}. A policy must be tested "
+                          "on contexts it was not trained on")
+
+
+def summary(instances: InstanceSet, bounds: ContextBounds) -> list[tuple[str, float, float, float]]:
+    """(name, minimum, mean, maximum) of each feature over the set, in its own units.
+
+    Raises ConfigError if the set does not have the features of `bounds`.
+    """
+    if instances.names != bounds.names:
+        raise ConfigError(f"the set's features are {_cut(', '.join(instances.names), 120)}, "
+                          f"the environment's are {_cut(', '.join(bounds.names), 120)}")
+    lowest, mean, highest = (of(instances.contexts, axis=0).tolist() for of in (np.min, np.mean, np.max))
+    return list(zip(instances.names, lowest, mean, highest, strict=True))
+
+
+def _check_kind_and_size(path: Path) -> None:
+    """Refuse by `stat` alone what must not be opened (a FIFO would block for ever) or is too large to be meant."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise ConfigError("there is no such file") from None
+    except ValueError:  # Python's answer to a NUL in the name
+        raise ConfigError("this cannot be the name of a file") from None
+    if stat.S_ISDIR(status.st_mode):
+        raise ConfigError("is a folder, not a CSV file")
+    if not stat.S_ISREG(status.st_mode):
+        raise ConfigError("is not a regular file (a pipe, socket or device)")
+    if status.st_size == 0:
+        raise ConfigError("is empty; the first line must name the columns")
+    if status.st_size > MAX_FILE_BYTES:
+        raise ConfigError(f"has {status.st_size} bytes; an instance file may have at most {MAX_FILE_BYTES}")
+
+
+def _lines(file: BinaryIO, first_row: int) -> Iterator[tuple[int, bytes]]:
+    """(row number, line without surrounding white space) to the end of the file; never holds more than one line."""
+    for row, line in enumerate(iter(lambda: file.readline(MAX_LINE_BYTES + 1), b""), start=first_row):
+        if len(line) > MAX_LINE_BYTES:
+            raise ConfigError(f"row {row} is longer than {MAX_LINE_BYTES} bytes")
+        yield row, line.strip()
+
+
+def _split(row: int, line: bytes) -> list[bytes]:
+    """The cells of a line. A name or a number contains neither comma nor quote, so quotes can only surround it."""
+    if b"\r" in line:
+        raise ConfigError(f"row {row} contains a bare carriage return; lines must end in \\n or \\r\\n")
+    cells = line.split(b",")
+    if b'"' in line:
+        bare = [cell.strip() for cell in cells]
+        cells = [cell[1:-1] if len(cell) > 1 and cell[:1] == cell[-1:] == b'"' else cell for cell in bare]
+    return cells
+
+
+def _read_header(file: BinaryIO, bounds: ContextBounds) -> list[str]:
+    """The names of the columns, as the file orders them: `id` and each feature, once each."""
+    expected = ("id", *bounds.names)
+    allowed = f"allowed are {_cut(', '.join(expected), 200)}, each once, separated by commas"
+    row, line = next(_lines(file, first_row=1), (1, b""))
+    line = line.removeprefix(b"\xef\xbb\xbf")
+    if b"\0" in line:
+        raise ConfigError("row 1 contains a NUL byte: this is not a CSV file in UTF-8")
+    try:
+        columns = [cell.decode().strip() for cell in _split(row, line)]
+    except UnicodeDecodeError:
+        raise ConfigError(f"row 1 is not UTF-8 text: {_shown(line)}") from None
+    if columns == [""]:
+        raise ConfigError(f"row 1 is blank where the columns must be named: {allowed}")
+    known, seen = set(expected), set[str]()
+    for column in columns:
+        if column not in known:
+            missing = sorted(known.difference(columns))
+            raise ConfigError(f"row 1: unknown column {_shown(column)}{nearest(column[:100], missing)} ({allowed})")
+        if column in seen:
+            raise ConfigError(f"row 1: the column {_shown(column)} is there twice ({allowed})")
+        seen.add(column)
+    for name in expected:
+        if name not in seen:
+            raise ConfigError(f"row 1: the column {_shown(name)} is missing ({allowed})")
+    return columns
+
+
+def _read_rows(
+    file: BinaryIO, columns: Sequence[str], bounds: ContextBounds
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """`(n,)` ids and `(n, d)` contexts, features in the order of `bounds`, instances in that of the file.
+
+    Row i stands on line i + 2 of the file, because no blank line is accepted before another row.
+    """
+    ids, values = array("q"), array("d")
+    id_position = columns.index("id")
+    features = [(columns.index(name), low, high)
+                for name, low, high in zip(bounds.names, bounds.low.tolist(), bounds.high.tolist(), strict=True)]
+    for row, line in _lines(file, first_row=2):
+        if not line:
+            _refuse_more(file, row)
+            break
+        if len(ids) == MAX_INSTANCES:
+            raise ConfigError(f"holds more than {MAX_INSTANCES} instances")
+        cells = _split(row, line)
+        if len(cells) != len(columns):
+            raise ConfigError(f"row {row} has {len(cells)} cells where row 1 names {len(columns)} columns "
+                              f"({_cut(', '.join(columns), 200)}): {_shown(line)}")
+        position = id_position
+        try:
+            if b"_" in line:  # Python would read 1_0 as 10
+                position = next(i for i, cell in enumerate(cells) if b"_" in cell)
+                raise ValueError
+            identity = int(cells[id_position])
+            if identity < 0:
+                raise ValueError
+            ids.append(identity)
+            for position, low, high in features:
+                value = float(cells[position])
+                if not low <= value <= high:  # also false for NaN
+                    raise ValueError
+                values.append(value)
+        except (ValueError, OverflowError):
+            raise ConfigError(_cell_fault(row, columns, cells, position, bounds)) from None
+    if not ids:
+        raise ConfigError("has a header but no instances")
+    return np.frombuffer(ids, dtype=np.int64), np.frombuffer(values, dtype=np.float64).reshape(len(ids), -1)
+
+
+def _refuse_more(file: BinaryIO, blank_row: int) -> None:
+    """Refuse anything but white space from here to the end of the file."""
+    while chunk := file.read(MAX_LINE_BYTES):
+        if chunk.strip():
+            raise ConfigError(f"row {blank_row} is blank, but more rows follow; blank lines may only end the file")
+
+
+def _cell_fault(row: int, columns: Sequence[str], cells: Sequence[bytes], position: int, bounds: ContextBounds) -> str:
+    """Why this cell was refused, and what would not have been."""
+    cell, column = cells[position].strip(), columns[position]
+    if column == "id":
+        what, allowed = "is not an id", f"a whole number from 0 to {MAX_ID}"
+    else:
+        feature = bounds.names.index(column)
+        allowed = f"a number in [{bounds.low[feature]}, {bounds.high[feature]}]"
+        try:
+            if b"_" in cell:
+                raise ValueError
+            what = "is outside the bounds" if np.isfinite(float(cell)) else "is not finite"
+        except ValueError:
+            what = "is not a number"
+    return f"row {row}, column {_shown(column)}: {_shown(cell)} {what}; allowed is {allowed}"
+
+
+def _refuse_repeats(ids: NDArray[np.int64], contexts: NDArray[np.float64]) -> None:
+    """Refuse an id or a context that is there twice. Rows are `(n,)` and `(n, d)` in the order of the file."""
+    first, second = _repeats(ids[:, np.newaxis])
+    if second.size:
+        raise ConfigError(f"row {first[0] + 2} and row {second[0] + 2}, column 'id': both are {ids[first[0]]}; "
+                          "each id may occur once")
+    first, second = _repeats(contexts)
+    if second.size:
+        raise ConfigError(f"row {first[0] + 2} (id {ids[first[0]]}) and row {second[0] + 2} (id {ids[second[0]]}) "
+                          "hold the same context; each context may occur once")
+
+
+def _repeats(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(earlier, later): for each of the k rows of `(n, d)` that occurred before, where it did last, and its own index.
+
+    Both are `(k,)`, sorted by the later.
+    """
+    order = np.lexsort(rows.T)  # stable: among equal rows the index ascends
+    ranked = rows[order]
+    equal = np.flatnonzero((ranked[1:] == ranked[:-1]).all(axis=1))
+    earlier, later = order[equal], order[equal + 1]
+    by_later = np.argsort(later)
+    return earlier[by_later], later[by_later]
+
+
+def _check_names(names: tuple[str, ...]) -> None:
+    """Refuse feature names that a CSV header could not carry unquoted, or that would be confused with another."""
+    if not names:
+        raise ConfigError("a context needs at least one feature")
+    for name in names:
+        if name == "id" or name != name.strip() or not name or not name.isprintable() or set(name) & set(',"'):
+            raise ConfigError(f"{_shown(name)} cannot name a feature: names are printable, neither 'id' nor empty, "
+                              "without commas, double quotes or surrounding spaces")
+    if len(set(names)) < len(names):
+        doubled = next(name for name in names if names.count(name) > 1)
+        raise ConfigError(f"the feature {_shown(doubled)} is named twice")
+
+
+def _freeze(owner: ContextBounds | InstanceSet, **arrays: NDArray[np.generic]) -> None:
+    """Set fields of a frozen dataclass to arrays that can no longer be written to."""
+    for field, values in arrays.items():
+        values.setflags(write=False)
+        object.__setattr__(owner, field, values)
+
+
+def _cut(text: str, limit: int) -> str:
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def _shown(found: str | bytes) -> str:
+    """What was found, quoted and cut short: it may be hostile, and a terminal shall not act on it."""
+    found = found[:200]
+    if isinstance(found, bytes):
+        try:
+            found = found.decode()
+        except UnicodeDecodeError:
+            return _cut(repr(found), 60)
+    return _cut(repr(found), 60)
+
+
+def _shown_path(path: Path) -> str:
+    """The path as it is where that is short and printable; else quoted, and its end, which tells files apart."""
+    text = str(path) if str(path).isprintable() else repr(str(path))
+    return text if len(text) <= 200 else "…" + text[-199:]
+
+
+POINTMASS_BOUNDS: Final = ContextBounds(
+    names=("gate_x", "gate_width", "friction"),
+    low=np.array([-4.0, 0.5, 0.0]),
+    high=np.array([4.0, 8.0, 4.0]),
+)
+"""PointMass (Klink et al. 2020): centre and width of the gate in the world's length units, friction in 1/s."""
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows."""
+
+    description: str
+    source: str
+    bounds: ContextBounds
+    draw: Callable[[np.random.Generator, int], NDArray[np.float64]]
+
+
+def _draw_pointmass_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    return rng.uniform(POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high, size=(n, 3))
+
+
+def _draw_pointmass_target(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """The target N((2.5, 0.5, 0), sigma (4e-3, 3.75e-3, 2e-3)), *clipped* to the bounds.
+
+    Two of its means lie on a lower bound, so about half of the gate widths are exactly 0.5 and half of the frictions
+    exactly 0.
+    """
+    drawn = rng.normal((2.5, 0.5, 0.0), (4e-3, 3.75e-3, 2e-3), size=(n, 3))
+    return np.clip(drawn, POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high)
+
+
+DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
+    "pointmass_uniform": Distribution(
+        description="PointMass, each feature uniform within its bounds",
+        source="Klink et al. 2020 (the bounds)",
+        bounds=POINTMASS_BOUNDS,
+        draw=_draw_pointmass_uniform,
+    ),
+    "pointmass_target": Distribution(
+        description="PointMass, N((2.5, 0.5, 0), sigma (4e-3, 3.75e-3, 2e-3)) clipped to the bounds, which puts "
+        "about half of the gate widths at 0.5 and half of the frictions at 0",
+        source="Klink et al. 2020 (the target distribution); the clipping is ours",
+        bounds=POINTMASS_BOUNDS,
+        draw=_draw_pointmass_target,
+    ),
+}
+
+
+def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[InstanceSet, InstanceSet]:
+    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), drawn from one of `DISTRIBUTIONS`.
+
+    They are disjoint by construction: one set of distinct contexts is drawn, what repeats drawn again, and then
+    split. A pure function of all four arguments. Raises ConfigError for an unknown distribution, for counts below 1
+    or above 10 million together, for a negative seed, and if there are not that many distinct contexts to be found.
+    """
+    if distribution not in DISTRIBUTIONS:
+        raise ConfigError(f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], DISTRIBUTIONS)} "
+                          f"(known are {', '.join(DISTRIBUTIONS)})")
+    total = n_train + n_test
+    if min(n_train, n_test) < 1 or total > MAX_INSTANCES:
+        raise ConfigError(f"cannot sample {n_train} training and {n_test} test instances: at least 1 of each, "
+                          f"at most {MAX_INSTANCES} together")
+    if seed < 0:
+        raise ConfigError(f"the seed {seed} is negative; allowed are whole numbers from 0")
+    chosen = DISTRIBUTIONS[distribution]
+    rng = generator(seed, Purpose.INSTANCES, int.from_bytes(distribution.encode(), "big"), n_train, n_test)
+    contexts = np.empty((0, len(chosen.bounds.names)))
+    for _ in range(MAX_REDRAWS):
+        contexts = np.vstack((contexts, chosen.draw(rng, total - len(contexts))))
+        contexts = np.delete(contexts, _repeats(contexts)[1], axis=0)
+        if len(contexts) == total:
+            ids, names = np.arange(total), chosen.bounds.names
+            train = InstanceSet(ids[:n_train], contexts[:n_train], names)
+            return train, InstanceSet(ids[n_train:], contexts[n_train:], names)
+    raise ConfigError(f"found only {len(contexts)} distinct contexts of {distribution} where {total} were asked for")

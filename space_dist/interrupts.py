@@ -1,0 +1,51 @@
+"""Being asked to stop: signals and a flag file. Imports nothing heavy, so that handlers stand before anything else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from pathlib import Path
+from types import FrameType
+
+from space_dist.errors import Interrupted
+
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+
+
+class StopRequests:
+    """Remembers the first request to stop; a run asks for it between rounds.
+
+    If the run does not get there within `grace_seconds` of the signal, the process ends on its last checkpoint, with
+    the same exit code. A second SIGINT ends it at once.
+    """
+
+    def __init__(self) -> None:
+        self._reason: str | None = None
+        self._file: Path | None = None
+        self._grace_seconds = 25.0
+
+    def install(self) -> None:
+        """Set the handlers; to be called again after whatever replaces them (`ray.init` takes SIGTERM)."""
+        for number in STOP_SIGNALS:
+            signal.signal(number, self._on_signal)
+
+    def watch(self, stop_file: Path, grace_seconds: float) -> None:
+        """Also stop once `stop_file` exists."""
+        self._file, self._grace_seconds = stop_file, grace_seconds
+
+    def reason(self) -> str | None:
+        """Why to stop, or None."""
+        if self._reason is None and self._file is not None and self._file.exists():
+            self._reason = f"the file {self._file}"
+        return self._reason
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - the signature is Python's
+        if self._reason is not None:
+            if number == signal.SIGINT:
+                os._exit(Interrupted.exit_code)
+            return
+        self._reason = signal.Signals(number).name
+        timer = threading.Timer(self._grace_seconds, os._exit, (Interrupted.exit_code,))
+        timer.daemon = True
+        timer.start()
