@@ -26,7 +26,6 @@ from rich.table import Table
 from space_dist.errors import ConfigError, SpaceDistError
 
 if TYPE_CHECKING:
-    from space_dist.rollout import MlpWeights
     from space_dist.training import Progress
 
 app = typer.Typer(
@@ -100,6 +99,7 @@ def evaluate(
     from space_dist import config as configs
     from space_dist.envs import make_batched
     from space_dist.instances import read_csv
+    from space_dist.launch import policy_of
     from space_dist.ledger import Ledger
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
@@ -107,7 +107,7 @@ def evaluate(
     ledger = Ledger(run)
     status = ledger.status()
     config = configs.load(ledger.config)
-    weights = _policy(ledger)
+    weights = policy_of(ledger)
     env_one = make_batched(config.env.id, 1, context_visible=False)
     chosen = read_csv(instances, env_one.context_bounds)
     env = make_batched(config.env.id, len(chosen), context_visible=config.env.context_visible)
@@ -239,10 +239,6 @@ def config_check(
     run = configs.load(config, list(overrides or []))
     make_setup(run, *read_instances(run))
     print(configs.dump(run), end="")
-
-
-def _policy(ledger: object) -> MlpWeights:
-    raise NotImplementedError
 
 
 def _write(path: Path, text: str) -> None:

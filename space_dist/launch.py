@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import json
 import logging
+import os
 import platform
+import secrets
 import subprocess
 import sys
 import time
 import traceback
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from space_dist import config as configs
@@ -22,9 +27,9 @@ from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
-from space_dist.ledger import Ledger, RunWriter, Status
-from space_dist.rollout import Setup
-from space_dist.training import Cluster, InProcess, Progress, Training, make_setup
+from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
+from space_dist.rollout import MlpWeights, Setup, from_arrays
+from space_dist.training import Cluster, InProcess, Progress, Training, make_setup, policy_in
 
 log = logging.getLogger("space_dist")
 
@@ -163,11 +168,29 @@ def absolute_uri(uri: str | None) -> str | None:
     return f"{prefix}{Path(uri.removeprefix(prefix)).absolute()}" if uri and uri.startswith(prefix) else uri
 
 
+def policy_of(ledger: Ledger) -> MlpWeights:
+    """The policy of a finished run, or that of an unfinished one's last checkpoint. Raises LedgerError without any."""
+    if ledger.model_arrays.exists() and ledger.model_description.exists():
+        try:
+            with np.load(ledger.model_arrays, allow_pickle=False) as file:
+                return from_arrays(dict(file), json.loads(ledger.model_description.read_bytes()))
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError):
+            raise LedgerError(f"the model in {ledger.folder} is damaged (model.npz, model.json)") from None
+    for file in ledger.checkpoint_files():
+        with contextlib.suppress(ValueError, OSError):
+            return policy_in(decode_checkpoint(file.read_bytes()), configs.load(ledger.config))
+    raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
+
+
 @contextlib.contextmanager
 def _cluster(config: RunConfig, setup: Setup, stop: StopRequests) -> Iterator[Cluster]:
     if config.resources.workers == 0:
         yield InProcess(config, setup)
         return
+    if config.resources.address == "local":
+        # Ray runs whatever its ports are sent, so only who holds this process's own token may talk to them. Ray reads
+        # these once, when it is imported; unset, it makes up a token and leaves it in the user's home.
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     from space_dist.distributed import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with RayCluster(config, setup) as cluster:

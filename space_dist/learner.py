@@ -122,7 +122,7 @@ class Learner:
             values, log_probs, _ = policy.evaluate_actions(flat, flat_actions)
             for index, shard in enumerate(shards):
                 if len(shard.truncated_observations):
-                    behind = policy.predict_values(torch.as_tensor(shard.truncated_observations)).numpy()[:, 0]
+                    behind = policy.predict_values(torch.tensor(shard.truncated_observations)).numpy()[:, 0]
                     mine = np.argwhere(shard.truncated)
                     rewards[mine[:, 0], mine[:, 1] + index * shard.rewards.shape[1]] += self.model.gamma * behind
             last = np.concatenate([shard.last_observations for shard in shards])

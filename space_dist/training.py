@@ -35,6 +35,7 @@ from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunW
 from space_dist.rollout import (
     CUT,
     FloatArray,
+    MlpWeights,
     Outcomes,
     Setup,
     Shard,
@@ -255,14 +256,9 @@ class Training:
     ) -> None:
         self._config, self._setup, self._cluster, self._writer = config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
-        env = make_batched(config.env.id, 1, context_visible=config.env.context_visible)
-        self._horizon = env.horizon
+        self._horizon = make_batched(config.env.id, 1, context_visible=False).horizon
         self._total_steps = config.rounds * config.learner.n_steps
-        self.learner = Learner(
-            config.learner, env.observation_space, env.action_space,
-            seed=config.seed, n_slots=setup.shards * setup.slots, slot_length=setup.slot_length,
-            total_steps=self._total_steps,
-        )  # fmt: skip
+        self.learner = make_learner(config)
         self._run = _Run()
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
@@ -490,11 +486,7 @@ class Training:
 
     def _restore(self, checkpoint: Checkpoint) -> Handle:
         run, cluster, data = self._run, self._cluster, checkpoint.data["run"]
-        prefix = "learner/"
-        self.learner.load(
-            {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)},
-            checkpoint.data["learner"],
-        )
+        _load_learner(self.learner, checkpoint)
         for name in ("round", "iteration", "version", "rows", "evaluated_at", "rollouts", "updates", "gradient_steps"):
             setattr(run, name, data[name])
         order, positions = data["walk"]
@@ -516,6 +508,29 @@ class Training:
     def _show(self) -> None:
         self.progress.steps = self._steps()
         self._observe(self.progress)
+
+
+def make_learner(config: RunConfig) -> Learner:
+    """A config's learner with its initial network."""
+    env = make_batched(config.env.id, 1, context_visible=config.env.context_visible)
+    return Learner(
+        config.learner, env.observation_space, env.action_space,
+        seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots, slot_length=config.slot_length,
+        total_steps=config.rounds * config.learner.n_steps,
+    )  # fmt: skip
+
+
+def policy_in(checkpoint: Checkpoint, config: RunConfig) -> MlpWeights:
+    """The policy that a checkpoint holds."""
+    learner = make_learner(config)
+    _load_learner(learner, checkpoint)
+    return learner.weights(checkpoint.round)
+
+
+def _load_learner(learner: Learner, checkpoint: Checkpoint) -> None:
+    prefix = "learner/"
+    arrays = {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
+    learner.load(arrays, checkpoint.data["learner"])
 
 
 def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int, total_steps: int) -> float:

@@ -153,6 +153,8 @@ FAULTS: list[tuple[str, str | bytes, list[str]]] = [
     ("missing id", with_cell(3, 0, ""), ["row 3, column 'id': '' is not an id"]),
     ("doubled id", with_cell(4, 0, "0"), ["row 2 and row 4, column 'id': both are 0"]),
     ("doubled context", VALID + "9,1.5,2.50,35e-1\n", ["row 3 (id 1) and row 5 (id 9)", "same context"]),
+    ("first of two", VALID + "9,1.5,2.5,3.5\n8,-1.0,0.5,0.0\n7,-1.0,0.5,0.0\n", ["row 3 (id 1) and row 5 (id 9)"]),
+    ("first of two ids", VALID + "2,0,1,1\n0,0,2,2\n", ["row 4 and row 5, column 'id': both are 2"]),
     ("zero twice", VALID + "9,-1.0,0.5,-0.0\n", ["row 4 (id 2) and row 5 (id 9)", "same context"]),
     ("blank line within", HEADER + "0,1.0,2.0,3.0\n\n\n1,2.0,2.0,2.0\n", ["row 3 is blank, but more rows follow"]),
     ("open quote", with_cell(3, 1, '"1.5'), ["row 3, column 'gate_x': '\"1.5' is not a number"]),
@@ -409,8 +411,9 @@ def test_overlap() -> None:
     train = InstanceSet(np.arange(5), np.arange(10.0).reshape(5, 2), ("a", "b"))
     apart = InstanceSet(np.arange(5), np.arange(10.0).reshape(5, 2) + 0.5, ("a", "b"))
     refuse_overlap(train, apart, "train.csv", "test.csv")  # equal ids are no overlap
-    # the same number twice within one set is not an overlap either
-    refuse_overlap(InstanceSet(np.arange(2), np.zeros((2, 2)), ("a", "b")), apart, "train.csv", "test.csv")
+    doubled = InstanceSet(np.arange(2), np.full((2, 2), -1.0), ("a", "b"))  # within one set: no overlap either
+    refuse_overlap(doubled, apart, "train.csv", "test.csv")
+    refuse_overlap(apart, doubled, "train.csv", "test.csv")
     shared = InstanceSet(np.array([70, 71]), np.array([[0.0, 9.0], [4.0, 5.0]]), ("a", "b"))
     with pytest.raises(ConfigError, match=r"id 2 of train.csv is id 71 of test.csv\. A policy"):
         refuse_overlap(train, shared, "train.csv", "test.csv")

@@ -1,0 +1,84 @@
+"""Reports: ledgers in; a figure, a table and their caveats out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from space_dist.errors import ConfigError
+from space_dist.ledger import Ledger, atomic_write
+from space_dist.report.figures import draw_comparison, draw_curriculum, draw_learning_curve, save
+from space_dist.report.load import Configuration, Run, group, load_run, read_config
+from space_dist.report.statistics import RESAMPLES, Estimate, bootstrap_interval, estimate, interquartile_mean
+from space_dist.report.tables import Summary, cells, remarks, summarise, to_csv, to_markdown
+
+__all__ = [
+    "Configuration",
+    "Estimate",
+    "Report",
+    "Run",
+    "Summary",
+    "bootstrap_interval",
+    "build_report",
+    "draw_comparison",
+    "draw_curriculum",
+    "draw_learning_curve",
+    "estimate",
+    "group",
+    "interquartile_mean",
+    "load_run",
+    "read_config",
+    "save",
+    "summarise",
+]
+
+_METHOD = f"""\
+Final numbers are those of each finished run's evaluation at its last step; returns are undiscounted means over the
+instances. IQM: interquartile mean over seeds (below four seeds the plain mean). [95 %]: percentile bootstrap over
+seeds, {RESAMPLES:,} resamples; with few seeds it is narrower than it should be, and a single seed has none. Curves show
+finished runs (while there is none, unfinished ones) at steps where every drawn seed was evaluated; bands are the same
+intervals. Steps are real environment steps of training. "All instances reached": finished runs that were trained on
+all their instances at once, and from which step on (median over those)."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `build_report` wrote. `table` has one dict (column -> text) a configuration, with the same columns in all;
+    `remarks` are sentences that belong below it."""
+
+    table: list[dict[str, str]]
+    remarks: list[str]
+    summaries: list[Summary]
+    markdown: str
+    figure: Path
+
+
+def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
+    """Compare runs: writes `report.png`, `report.md` and `report.csv` into `out`, which is created.
+
+    Raises ConfigError if there are no ledgers, if a configuration has the same seed twice, or if `out` cannot be
+    written to; LedgerError if a ledger is damaged.
+    """
+    if not ledgers:
+        raise ConfigError("there are no runs to report on")
+    configurations = group([load_run(ledger) for ledger in ledgers])
+    summaries = [summarise(configuration) for configuration in configurations]
+    table = [cells(summary) for summary in summaries]
+    notes = [line for configuration in configurations for line in remarks(configuration)]
+    parts = [
+        "# Report",
+        to_markdown(table),
+        *(["\n".join(f"- {note}" for note in notes)] if notes else []),
+        "![Learning curves and set sizes](report.png)",
+        _METHOD,
+    ]
+    markdown = "\n\n".join(parts) + "\n"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        save(draw_comparison(configurations), out / "report.png")
+        atomic_write(out / "report.md", markdown.encode())
+        atomic_write(out / "report.csv", to_csv(summaries).encode())
+    except OSError as error:
+        raise ConfigError(f"the report cannot be written to {out}: {error.strerror or error}") from None
+    return Report(table, notes, summaries, markdown, out / "report.png")

@@ -1,0 +1,214 @@
+"""Learning curves and the curriculum's course, drawn without any global state of Matplotlib."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.ledger import atomic_write
+from space_dist.report.load import Configuration, FloatArray, IntArray, Run
+from space_dist.report.statistics import bootstrap_interval, interquartile_mean
+
+# Okabe and Ito's palette: told apart with every common colour blindness; its yellow is left out, too pale for lines.
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+LINE_STYLES: Final = ("-", "--", ":", "-.")
+MAX_ROWS: Final = 500
+MAX_COLUMNS: Final = 1000
+MAX_LABELLED_INSTANCES: Final = 30
+_STEPS_LABEL: Final = "environment steps"
+_RETURN_LABEL: Final = "return per episode"
+_DPI: Final = 150
+
+
+def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
+    """Test returns, train returns and set sizes over real environment steps, one colour for each configuration.
+
+    Returns are IQMs over seeds with 95 % bootstrap bands, at the steps where every drawn seed was evaluated. Sizes are
+    medians over seeds as far as all drawn seeds got, with a thin line for each seed.
+    """
+    figure = _figure(15.0, 4.6 + 0.25 * ((len(configurations) - 1) // 3))
+    panels = figure.subplots(1, 3)
+    test, train, sizes = panels
+    for number, configuration in enumerate(configurations):
+        style = {
+            "color": COLOURS[number % len(COLOURS)],
+            "linestyle": LINE_STYLES[number // len(COLOURS) % len(LINE_STYLES)],
+        }
+        label = f"{configuration.label} ({_seed_count(configuration)})"
+        for axes, split in ((test, "test"), (train, "train")):
+            steps, returns = configuration.returns("test" if split == "test" else "train")
+            _draw_returns(axes, steps, returns, label, style)
+        _draw_set_sizes(sizes, configuration, label, style)
+    for axes, title, label in (
+        (test, "Test instances", f"mean {_RETURN_LABEL}"),
+        (train, "Training instances", f"mean {_RETURN_LABEL}"),
+        (sizes, "Curriculum", "instances trained on"),
+    ):
+        _dress(axes, title, label)
+    sizes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    sizes.set_ylim(bottom=0)
+    handles = [line for line in test.get_lines() if not line.get_label().startswith("_")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles) or 1), frameon=False)
+    return figure
+
+
+def draw_learning_curve(run: Run) -> Figure:
+    """One run: mean undiscounted train and test return, and the set size below, over real environment steps.
+
+    Raises LedgerError if the run was not evaluated yet.
+    """
+    if not len(run.evaluation_steps):
+        raise LedgerError(f"{run.ledger.folder} holds no evaluation yet")
+    figure = _figure(7.5, 6.5)
+    returns, sizes = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    for label, measures, colour, marker in (("test", run.test, COLOURS[0], "o"), ("train", run.train, COLOURS[1], "s")):
+        returns.plot(run.evaluation_steps, measures["return"], color=colour, marker=marker, markersize=3.5, label=label)
+    starts, trained = _set_size_steps(run)
+    sizes.plot(starts, trained, color=COLOURS[2], drawstyle="steps-post")
+    _dress(returns, f"{run.status.name}, seed {run.status.seed}", f"mean {_RETURN_LABEL}")
+    _dress(sizes, "", f"instances trained on\n(of {len(run.instance_ids):,})")
+    returns.set_xlabel("")
+    returns.legend(title="instances", frameon=False)
+    sizes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    sizes.set_ylim(bottom=0)
+    return figure
+
+
+def curriculum_shares(
+    trained: Sequence[IntArray], instance_ids: IntArray, max_rows: int = MAX_ROWS, max_columns: int = MAX_COLUMNS
+) -> tuple[IntArray, FloatArray]:
+    """When each instance was trained on: `(n,)` ids in order of first inclusion, and `(rows, columns)` shares.
+
+    Ties go by id, instances never trained on come last. A share is 1 where the row's instance was trained on in the
+    column's iteration and 0 elsewhere; with more instances than `max_rows` or more iterations than `max_columns`, a
+    row or column is a block of equally many (the last one may hold fewer) and the share is its mean.
+
+    `instance_ids` are `(n,)`, ascending. Raises LedgerError if another id was trained on.
+    """
+    n, m = len(instance_ids), len(trained)
+    first = np.full(n, m)
+    present = []
+    for iteration, ids in enumerate(trained):
+        positions = np.searchsorted(instance_ids, np.unique(ids))
+        if not np.array_equal(instance_ids[np.minimum(positions, n - 1)], np.unique(ids)):
+            raise LedgerError(f"iteration {iteration + 1} was trained on contexts that are not of the instance set")
+        first[positions] = np.minimum(first[positions], iteration)
+        present.append(positions)
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(n, dtype=np.int64)
+    rank[order] = np.arange(n)
+    height, width = -(-n // max_rows), -(-m // max_columns)
+    counts = np.zeros((-(-n // height), -(-m // width) if m else 0))
+    for iteration, positions in enumerate(present):
+        counts[:, iteration // width] += np.bincount(rank[positions] // height, minlength=len(counts))
+    row_sizes = np.minimum(height, n - height * np.arange(counts.shape[0]))
+    column_sizes = np.minimum(width, m - width * np.arange(counts.shape[1]))
+    return instance_ids[order], counts / np.outer(row_sizes, column_sizes)
+
+
+def draw_curriculum(run: Run) -> Figure:
+    """A heat map: which instances (rows) the run was trained on in which iteration (columns).
+
+    Raises LedgerError if there is no iteration yet, ConfigError if the curriculum generates its contexts: then there
+    are no instances to show.
+    """
+    if run.generates_contexts:
+        raise ConfigError(f"{run.ledger.folder} was trained on generated contexts: it has no map of instances")
+    if not run.trained:
+        raise LedgerError(f"{run.ledger.folder} holds no iteration yet")
+    order, shares = curriculum_shares(run.trained, run.instance_ids)
+    n, m = len(order), len(run.trained)
+    height, width = -(-n // MAX_ROWS), -(-m // MAX_COLUMNS)
+    figure = _figure(7.5, 5.5)
+    axes = figure.subplots()
+    colours = LinearSegmentedColormap.from_list("share", ["#FFFFFF", COLOURS[0]])
+    image = axes.imshow(
+        shares, cmap=colours, vmin=0.0, vmax=1.0, aspect="auto", origin="lower", interpolation="nearest",
+        extent=(0.5, 0.5 + width * shares.shape[1], 0.5, 0.5 + height * shares.shape[0]),
+    )  # fmt: skip
+    axes.set_xlim(0.5, m + 0.5)
+    axes.set_ylim(0.5, n + 0.5)
+    axes.set_title(f"{run.status.name}, seed {run.status.seed}: instances trained on", fontsize=11)
+    axes.set_xlabel("iteration")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    if n <= MAX_LABELLED_INSTANCES:
+        axes.set_yticks(np.arange(1, n + 1), [str(identity) for identity in order.tolist()], fontsize=8)
+        axes.set_ylabel("instance id, in order of first inclusion")
+    else:
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_ylabel("instance, in order of first inclusion")
+    if height > 1 or width > 1:
+        figure.colorbar(image, ax=axes, label=f"share of {height} instances × {width} iterations trained on")
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG, whole or not at all. Raises OSError."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    atomic_write(path, buffer.getvalue())
+
+
+def _figure(width: float, height: float) -> Figure:
+    """An empty white figure, in inches, whose parts keep out of each other's way."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _dress(axes: Axes, title: str, label: str) -> None:
+    axes.set_title(title, fontsize=11)
+    axes.set_xlabel(_STEPS_LABEL)
+    axes.set_ylabel(label)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
+    axes.set_xlim(left=0)
+    axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if not axes.has_data():
+        axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", va="center", color="#777777")
+
+
+def _draw_returns(axes: Axes, steps: IntArray, returns: FloatArray, label: str, style: dict[str, Any]) -> None:
+    """One line with its band. A single evaluation would make an invisible line, so points are marked while few."""
+    centre = interquartile_mean(returns) if len(returns) else np.zeros(0)
+    marker = "o" if len(steps) <= 40 else None
+    axes.plot(steps, centre, label=label, marker=marker, markersize=3, linewidth=1.8, **style)
+    if len(returns) > 1:
+        low, high = bootstrap_interval(returns)
+        axes.fill_between(steps, low, high, color=style["color"], alpha=0.18, linewidth=0)
+
+
+def _draw_set_sizes(axes: Axes, configuration: Configuration, label: str, style: dict[str, Any]) -> None:
+    curves = [_set_size_steps(run) for run in configuration.drawn if run.trained]
+    if not curves:
+        return
+    for steps, sizes in curves:
+        axes.plot(steps, sizes, drawstyle="steps-post", linewidth=0.7, alpha=0.45, label=f"_{label}", **style)
+    last = min(steps[-1] for steps, _ in curves)
+    grid = np.unique(np.concatenate([steps[steps <= last] for steps, _ in curves]))
+    at = [sizes[np.searchsorted(steps, grid, side="right") - 1] for steps, sizes in curves]
+    axes.plot(grid, np.median(at, axis=0), drawstyle="steps-post", linewidth=2.0, label=label, **style)
+
+
+def _set_size_steps(run: Run) -> tuple[IntArray, IntArray]:
+    """Where the set size changes, for a line of steps: the iterations' starts, and the end of the last one."""
+    starts, sizes = run.set_size
+    return np.append(starts, run.iteration_ends[-1:]), np.append(sizes, sizes[-1:])
+
+
+def _seed_count(configuration: Configuration) -> str:
+    drawn, n = len(configuration.drawn), len(configuration.runs)
+    unfinished = "" if configuration.finished else ", unfinished"
+    return (f"{n} seed{'s' if n > 1 else ''}" if drawn == n else f"{drawn} of {n} seeds") + unfinished

@@ -1,0 +1,226 @@
+"""Ledgers read back: what a run was, how it went, and which runs are seeds of one configuration."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from space_dist.config import NOT_IDENTITY
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.ledger import CURRICULUM, METRICS, Ledger, Row, Status
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Split = Literal["test", "train"]
+
+MEASURES: Final = ("return", "discounted_return", "length", "success")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run as its ledger tells it. The k evaluations and the m iterations are in order of time.
+
+    `instance_ids` `(n,)` are the training instances, ascending. `evaluation_steps` `(k,)` are real environment steps;
+    `train` and `test` map each of MEASURES to `(k,)` means over the split's instances in the environment's units, NaN
+    where there is no such number. `iteration_ends` `(m,)` are real environment steps, `trained` the m arrays of ids
+    that were trained on, in order.
+    """
+
+    ledger: Ledger
+    config: Mapping[str, Any]
+    status: Status
+    instance_ids: IntArray
+    evaluation_steps: IntArray
+    train: Mapping[str, FloatArray]
+    test: Mapping[str, FloatArray]
+    iteration_ends: IntArray
+    trained: tuple[IntArray, ...]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run used up its budget; only then do its final numbers count."""
+        return self.status.state == "done"
+
+    @property
+    def evaluated_at_end(self) -> bool:
+        """Whether the run is finished and its last evaluation was of the policy it finished with."""
+        return self.finished and len(self.evaluation_steps) > 0 and self.evaluation_steps[-1] == self.status.steps
+
+    @property
+    def generates_contexts(self) -> bool:
+        """Whether some contexts it was trained on are not of the instance set (their id is -1)."""
+        return any(bool((ids < 0).any()) for ids in self.trained)
+
+    def final(self, split: Split, measure: str) -> float:
+        """The last evaluation's mean over the split. Raises LedgerError if nothing was evaluated yet."""
+        if not len(self.evaluation_steps):
+            raise LedgerError(f"{self.ledger.folder} holds no evaluation yet")
+        return float((self.test if split == "test" else self.train)[measure][-1])
+
+    @functools.cached_property
+    def set_size(self) -> tuple[IntArray, IntArray]:
+        """`(m,)` real steps at which each iteration began, and `(m,)` the size of the set it was trained on."""
+        starts = np.concatenate((np.zeros(1, dtype=np.int64), self.iteration_ends))[:-1]
+        return starts, np.array([len(ids) for ids in self.trained], dtype=np.int64)
+
+    @functools.cached_property
+    def all_instances_reached_at(self) -> int | None:
+        """The real step from which the run was first trained on all its instances; None if it never was."""
+        everything = len(self.instance_ids)
+        starts, _ = self.set_size
+        for start, ids in zip(starts.tolist(), self.trained, strict=True):
+            if len(ids) >= everything and len(np.unique(ids[ids >= 0])) == everything:
+                return int(start)
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Configuration:
+    """Runs that differ by nothing but their seed, ordered by it. `label` is the name, made unique in the report."""
+
+    label: str
+    runs: tuple[Run, ...]
+
+    @property
+    def finished(self) -> tuple[Run, ...]:
+        """The runs whose final numbers count."""
+        return tuple(run for run in self.runs if run.finished)
+
+    @property
+    def drawn(self) -> tuple[Run, ...]:
+        """The runs whose curves are drawn: the finished ones; while there is none, every one that was evaluated."""
+        return self.finished or tuple(run for run in self.runs if len(run.evaluation_steps))
+
+    def returns(self, split: Split) -> tuple[IntArray, FloatArray]:
+        """`(k,)` real steps at which every drawn run was evaluated, and its `(runs, k)` mean undiscounted returns."""
+        if not self.drawn:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 0))
+        steps = functools.reduce(np.intersect1d, (run.evaluation_steps for run in self.drawn))
+        curves = [
+            (run.test if split == "test" else run.train)["return"][np.searchsorted(run.evaluation_steps, steps)]
+            for run in self.drawn
+        ]
+        return steps, np.stack(curves)
+
+
+def read_config(ledger: Ledger) -> dict[str, Any]:
+    """A run's resolved config as plain data, so that runs of any version of the schema can be read.
+
+    Raises LedgerError if it is missing or not a YAML mapping.
+    """
+    try:
+        data = YAML(typ="safe", pure=True).load(ledger.config.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise LedgerError(f"{ledger.folder} is incomplete: it has no config.yaml") from None
+    except OSError as error:
+        raise LedgerError(f"{ledger.config} cannot be read: {error.strerror}") from None
+    except (YAMLError, ValueError, RecursionError):
+        raise LedgerError(f"{ledger.config} is damaged: it is not valid YAML") from None
+    if not isinstance(data, dict):
+        raise LedgerError(f"{ledger.config} is damaged: it holds no keys and values")
+    return data
+
+
+def load_run(ledger: Ledger) -> Run:
+    """Everything reports need of a run, rows behind its last checkpoint included.
+
+    Raises LedgerError if the folder is damaged or incomplete; having no rows yet is neither.
+    """
+    status = ledger.status()  # before the rows: a run that is done now has all of them
+    config, instance_ids = read_config(ledger), _instance_ids(ledger)
+    evaluations = [row for row in _rows(ledger, METRICS) if row.get("kind") == "evaluation"]
+    iterations = _rows(ledger, CURRICULUM)
+    try:
+        steps = np.array([int(row["steps"]) for row in evaluations], dtype=np.int64)
+        train, test = ({measure: _column(evaluations, split, measure) for measure in MEASURES}
+                       for split in ("train", "test"))  # fmt: skip
+        ends = np.array([int(row["steps"]) for row in iterations], dtype=np.int64)
+        trained = tuple(np.array(row["trained"], dtype=np.int64) for row in iterations)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise LedgerError(f"{ledger.folder} has rows that this version cannot read: {error!r}") from None
+    return Run(ledger, config, status, instance_ids, steps, train, test, ends, trained)
+
+
+def group(runs: Sequence[Run]) -> list[Configuration]:
+    """The configurations in the order of their first run. Raises ConfigError if a seed is there twice in one."""
+    members: dict[str, dict[int, Run]] = {}
+    for run in runs:
+        seeds = members.setdefault(_identity(run), {})
+        twin = seeds.setdefault(run.status.seed, run)
+        if twin is not run:
+            raise ConfigError(
+                f"seed {run.status.seed} of {run.status.name} is there twice: in {twin.ledger.folder} and in "
+                f"{run.ledger.folder}. A seed may count once; leave one of the folders out"
+            )
+    names = [next(iter(seeds.values())).status.name for seeds in members.values()]
+    return [
+        Configuration(
+            name if names.count(name) == 1 else f"{name} {identity[:6]}",
+            tuple(seeds[seed] for seed in sorted(seeds)),
+        )
+        for name, (identity, seeds) in zip(names, members.items(), strict=True)
+    ]
+
+
+def _identity(run: Run) -> str:
+    """A hash of all that decides results but the seed; instance files count by content, not by where they lay."""
+    data = {key: value for key, value in run.config.items() if key not in {"seed", *NOT_IDENTITY}}
+    data["instances"] = [_read_instances(run.ledger, split) for split in ("train", "test")]
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _read_instances(ledger: Ledger, split: Split) -> str:
+    path = ledger.instances(split)
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise LedgerError(f"{ledger.folder} is incomplete: it has no {path.name}") from None
+    except (OSError, UnicodeDecodeError):
+        raise LedgerError(f"{path} cannot be read") from None
+
+
+def _instance_ids(ledger: Ledger) -> IntArray:
+    header, *lines = _read_instances(ledger, "train").splitlines() or [""]
+    try:
+        column = [name.strip() for name in header.split(",")].index("id")
+        ids = sorted(int(line.split(",")[column]) for line in lines if line.strip())
+    except (ValueError, IndexError):
+        raise LedgerError(f"{ledger.instances('train')} is damaged: not every row has an id") from None
+    return np.array(ids, dtype=np.int64)
+
+
+def _rows(ledger: Ledger, name: str) -> list[Row]:
+    try:
+        return ledger.rows(name)
+    except OSError as error:
+        raise LedgerError(f"{ledger.folder / name} cannot be read: {error.strerror}") from None
+
+
+def _column(rows: Sequence[Row], split: str, measure: str) -> FloatArray:
+    return np.array([np.nan if row[split][measure] is None else row[split][measure] for row in rows], dtype=np.float64)
+
+
+def fingerprint_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
+    """What of code, machine and libraries differs between runs: field -> its values, sorted."""
+    fields = sorted({field for run in runs for field in run.status.fingerprint})
+    values = {field: sorted({str(run.status.fingerprint.get(field, "unknown")) for run in runs}) for field in fields}
+    return {field: found for field, found in values.items() if len(found) > 1}
+
+
+def standing(run: Run) -> str:
+    """Where a run stands, in words: `interrupted at 2,048 of 50,000 steps (SIGTERM)`."""
+    status = run.status
+    state: str = status.state
+    if state == "running" and not run.ledger.owner_alive():
+        state = "left behind by a process that is gone"
+    reason = f" ({status.message.splitlines()[0][:200]})" if status.message else ""
+    return f"{state} at {status.steps:,} of {status.budget_steps:,} steps{reason}"
