@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+# ruff: noqa: E402 - what follows must happen before anything heavy is imported
 # One thread for all arithmetic, in every process of ours, before any library reads these.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -42,7 +43,7 @@ errors = Console(stderr=True)
 
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders, or folders that hold some.")]
 Overrides = Annotated[
-    Optional[list[str]],  # noqa: UP007, UP045 - typer reads annotations at run time
+    Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
     typer.Option("--set", metavar="KEY=VALUE", help="Override a config key, e.g. budget.steps=20000. Repeatable."),
 ]
 
@@ -51,13 +52,13 @@ Overrides = Annotated[
 def train(
     config: Annotated[Path, typer.Argument(help="A run's YAML file.")],
     overrides: Overrides = None,
-    seed: Annotated[Optional[int], typer.Option(help="The run's seed.")] = None,  # noqa: UP007, UP045
+    seed: Annotated[Optional[int], typer.Option(help="The run's seed.")] = None,  # noqa: UP045
     workers: Annotated[
-        Optional[int],  # noqa: UP007, UP045
+        Optional[int],  # noqa: UP045
         typer.Option(help="Ray rollout actors; 0: everything in this process. Decides no result."),
     ] = None,
     out: Annotated[
-        Optional[Path],  # noqa: UP007, UP045
+        Optional[Path],  # noqa: UP045
         typer.Option(help="The run's folder. Default: runs/<name>/s<seed>."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the folder, if there is one.")] = False,
@@ -88,7 +89,7 @@ def evaluate(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
     instances: Annotated[Path, typer.Option(help="CSV of the instances to evaluate on.")],
     out: Annotated[
-        Optional[Path],  # noqa: UP007, UP045
+        Optional[Path],  # noqa: UP045
         typer.Option(help="Also write every instance's results to this CSV."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
@@ -120,9 +121,8 @@ def evaluate(
         for name, values in zip(names, columns, strict=True)
     }
     if out is not None:
-        lines = [f"id,{','.join(names)}"]
-        for row in zip(chosen.ids.tolist(), *(values.tolist() for values in columns), strict=True):
-            lines.append(",".join(map(str, row)))
+        rows = zip(chosen.ids.tolist(), *(values.tolist() for values in columns), strict=True)
+        lines = [f"id,{','.join(names)}", *(",".join(map(str, row)) for row in rows)]
         _write(out, "\n".join(lines) + "\n")
     if as_json:
         print(json.dumps({"run": str(run), "steps": status.steps, "state": status.state, "instances": str(instances),
@@ -157,10 +157,10 @@ def _print_report(result: object) -> None:
 def sync(
     runs: Runs,
     uri: Annotated[
-        Optional[str],  # noqa: UP007, UP045
+        Optional[str],  # noqa: UP045
         typer.Option(help="Tracking URI; default: each run's own (tracking.uri)."),
     ] = None,
-    experiment: Annotated[Optional[str], typer.Option(help="MLflow experiment.")] = None,  # noqa: UP007, UP045
+    experiment: Annotated[Optional[str], typer.Option(help="MLflow experiment.")] = None,  # noqa: UP045
     follow: Annotated[bool, typer.Option("--follow", help="Go on until the runs have ended.")] = False,
 ) -> None:
     """Replay runs into MLflow. Doing it twice changes nothing."""

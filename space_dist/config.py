@@ -25,7 +25,9 @@ _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class EnvConfig(_Section):
@@ -251,7 +253,8 @@ class RunConfig(_Section):
             )
         if self.budget.steps < self.learner.n_steps:
             raise ValueError(
-                f"budget.steps = {self.budget.steps} is less than one update of learner.n_steps = {self.learner.n_steps}"
+                f"budget.steps = {self.budget.steps} is less than one update of learner.n_steps = "
+                f"{self.learner.n_steps}"
             )
         return self
 
@@ -395,7 +398,7 @@ def _plain(value: Any, depth: int = 0) -> Any:
     if isinstance(value, dict):
         for key in value:
             if not isinstance(key, str):
-                raise ValueError(f"the key {_short(key)} is not a word")  # noqa: TRY004 - a fault of the file
+                raise ValueError(f"the key {_short(key)} is not a word")
         return {str(key): _plain(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         if len(value) > 10_000:

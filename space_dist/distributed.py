@@ -6,6 +6,7 @@ actor, and its selection back to them, by object reference, without passing thro
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
 from types import TracebackType
@@ -68,10 +69,12 @@ class RayCluster:
             if resources.address == "local":
                 ray.init(
                     address="local", num_cpus=resources.workers + 1, include_dashboard=False, log_to_driver=False,
-                    logging_level="ERROR", object_store_memory=_OBJECT_STORE_BYTES, configure_logging=False,
+                    logging_level=logging.ERROR, object_store_memory=_OBJECT_STORE_BYTES, configure_logging=False,
                 )  # fmt: skip
             else:
-                ray.init(address=resources.address, log_to_driver=False, logging_level="ERROR", configure_logging=False)
+                ray.init(
+                    address=resources.address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
+                )  # fmt: skip
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             raise SpaceDistError(
                 f"Ray cannot be started or reached at resources.address = {resources.address!r}: "
@@ -88,14 +91,14 @@ class RayCluster:
         setup = ray.put(self._setup)
         rollout = ray.remote(num_cpus=1, max_restarts=0)(RolloutActor)
         self._workers = [rollout.remote(setup) for _ in range(workers)]
-        self._central = ray.remote(num_cpus=0, max_restarts=0)(CurriculumActor).remote(self._config, setup)
+        self._central: Any = ray.remote(num_cpus=0, max_restarts=0)(CurriculumActor).remote(self._config, setup)
         try:
             ray.get([actor.ready.remote() for actor in (*self._workers, self._central)], timeout=_START_SECONDS)
         except GetTimeoutError:
+            total, free = _cpus()
             raise SpaceDistError(
                 f"Ray did not start {workers} rollout actors of one CPU each within {_START_SECONDS:.0f} s; "
-                f"the cluster has {ray.cluster_resources().get('CPU', 0):.0f} CPUs, "
-                f"{ray.available_resources().get('CPU', 0):.0f} of them free"
+                f"the cluster has {total:.0f} CPUs, {free:.0f} of them free"
             ) from None
         except RayTaskError as error:
             raise _cause(error) from error
@@ -154,6 +157,13 @@ class RayCluster:
 
     def _worker(self, piece: int) -> Any:
         return self._workers[piece % len(self._workers)]
+
+
+def _cpus() -> tuple[float, float]:
+    """CPUs of the cluster: all, and free ones."""
+    total: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+    free: dict[str, float] = ray.available_resources()  # type: ignore[no-untyped-call]
+    return total.get("CPU", 0.0), free.get("CPU", 0.0)
 
 
 def _cause(error: RayTaskError) -> Exception:

@@ -207,13 +207,13 @@ def _failures_noted(writer: RunWriter) -> Iterator[None]:
         log.warning("%s", error)
         raise
     except RunLockedError as error:
-        log.error("%s", error)  # noqa: TRY400 - the status now belongs to somebody else
+        log.error("%s", error)  # the status now belongs to somebody else
         raise
     except SpaceDistError as error:
         _note_failure(writer, str(error))
         raise
     except Exception as error:
-        log.error("%s", traceback.format_exc())  # noqa: TRY400 - the traceback is for the log alone
+        log.error("%s", traceback.format_exc())  # the traceback is for the log alone
         what = f"{type(error).__name__}: {error}"
         _note_failure(writer, what)
         raise SpaceDistError(f"the run failed: {what[:500]}. The traceback is in {writer.ledger.log}") from error

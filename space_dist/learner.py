@@ -187,7 +187,7 @@ def _build(
     algorithm = PPO if isinstance(config, PPOConfig) else TRPO
     model = algorithm(
         "MlpPolicy",
-        env=None,
+        env=None,  # type: ignore[arg-type] # as in SB3's own `load`; the spaces are set below
         n_steps=slot_length,
         learning_rate=(lambda remaining: rate * remaining) if linear else rate,
         policy_kwargs=policy_kwargs,
@@ -226,7 +226,7 @@ def _seeded(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
 
 @contextmanager
 def _divergence_explained(round: int) -> Iterator[None]:
-    """torch refuses distributions with NaN parameters with a ValueError that names tensors; users need the cause."""
+    """Users need the cause: torch refuses distributions of NaN with a ValueError that names tensors."""
     try:
         yield
     except ValueError as error:

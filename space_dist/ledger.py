@@ -221,7 +221,7 @@ def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     meta["sha256"] = _digest(meta, checkpoint.arrays)
     buffer = io.BytesIO()
     encoded = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
-    np.savez(buffer, meta=encoded, **{f"array/{name}": array for name, array in checkpoint.arrays.items()})
+    _savez(buffer, {"meta": encoded, **{f"array/{name}": array for name, array in checkpoint.arrays.items()}})
     return buffer.getvalue()
 
 
@@ -244,6 +244,10 @@ def decode_checkpoint(content: bytes) -> Checkpoint:
     except (zipfile.BadZipFile, KeyError, TypeError, AttributeError, OSError, EOFError, RecursionError,
             NotImplementedError, RuntimeError, MemoryError, zlib.error) as error:  # fmt: skip
         raise ValueError(str(error)) from None
+
+
+def _savez(buffer: io.BytesIO, arrays: Mapping[str, NDArray[Any]]) -> None:
+    np.savez(buffer, allow_pickle=False, **dict(arrays))
 
 
 def _digest(meta: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -386,7 +390,7 @@ class RunWriter:
     def write_model(self, arrays: Mapping[str, NDArray[Any]], description: Mapping[str, Any]) -> None:
         """Store the trained policy as `model.npz` and `model.json`."""
         buffer = io.BytesIO()
-        np.savez(buffer, **dict(arrays))
+        _savez(buffer, arrays)
         with _clear_errors(self.ledger.folder), self._lock.held():
             atomic_write(self.ledger.model_arrays, buffer.getvalue())
             atomic_write(self.ledger.model_description, json.dumps(description, indent=1).encode())

@@ -75,7 +75,8 @@ def from_arrays(arrays: Mapping[str, Array], description: Mapping[str, Any]) -> 
         return tuple((arrays[f"{part}.{index}.weight"], arrays[f"{part}.{index}.bias"]) for index in range(count))
 
     log_std = arrays["log_std"] if description["policy"] == "gaussian" else None
-    return MlpWeights(int(description["version"]), description["activation"], layers("actor"), layers("critic"), log_std)
+    activation: Literal["tanh", "relu"] = description["activation"]
+    return MlpWeights(int(description["version"]), activation, layers("actor"), layers("critic"), log_std)
 
 
 def forward(layers: Layers, activation: str, inputs: Array) -> Array:
@@ -102,9 +103,12 @@ def act(weights: MlpWeights, observations: Array, noise: Array | None) -> NDArra
     noise: (n, action_dim), standard normal for Gaussian policies and Gumbel for categorical ones.
     """
     outputs = forward(weights.actor, weights.activation, observations)
+    actions: NDArray[np.generic] = outputs
     if weights.log_std is None:
-        return np.argmax(outputs if noise is None else outputs + noise, axis=1)
-    return outputs if noise is None else outputs + np.exp(weights.log_std) * noise
+        actions = np.argmax(outputs if noise is None else outputs + noise, axis=1)
+    elif noise is not None:
+        actions = outputs + np.exp(weights.log_std) * noise
+    return actions
 
 
 def executed(action_space: spaces.Space[NDArray[np.generic]], actions: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -263,7 +267,8 @@ class Worker:
             self._starts[chunk] = start_observations(self._setup, chunk)
         observations = self._starts[chunk]
         scores = values(weights, observations).astype(np.float64)
-        return scores.reshape(-1, self._setup.start_states).mean(axis=1)
+        means: FloatArray = scores.reshape(-1, self._setup.start_states).mean(axis=1)
+        return means
 
     def evaluate(self, weights: MlpWeights, split: Split, part: int) -> Outcomes:
         """Deterministic episodes on one part of a split."""
@@ -357,7 +362,7 @@ def evaluate(
 
 
 def start_observations(setup: Setup, chunk: int) -> Array:
-    """`(chunk_size * start_states, obs_dim)` where episodes of a chunk's instances begin; on environments of its own."""
+    """`(chunk_size * start_states, obs_dim)` where a chunk's episodes begin; on an environment of its own."""
     first = chunk * setup.chunk_size
     contexts = setup.train.contexts[first : first + setup.chunk_size]
     contexts = np.repeat(contexts, setup.start_states, axis=0)
@@ -418,7 +423,14 @@ class _EpisodeTable:
         return np.flatnonzero(self._row_of >= 0)
 
     def episodes(self) -> Episodes:
-        columns = [np.array(column) for column in zip(*self._rows, strict=True)]
-        whole = {0, 1, 2, 3, 7}
-        typed = [column.astype(np.int64 if index in whole else np.float64) for index, column in enumerate(columns)]
-        return Episodes(*typed)
+        ids, slots, starts, lengths, returns, discounted, success, ends = zip(*self._rows, strict=True)
+        return Episodes(
+            ids=np.array(ids, dtype=np.int64),
+            slots=np.array(slots, dtype=np.int64),
+            starts=np.array(starts, dtype=np.int64),
+            lengths=np.array(lengths, dtype=np.int64),
+            returns=np.array(returns),
+            discounted_returns=np.array(discounted),
+            success=np.array(success),
+            ends=np.array(ends, dtype=np.int64),
+        )

@@ -177,8 +177,8 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
     if config.slot_length < horizon:
         raise ConfigError(
             f"learner.n_steps / (rollout.shards * rollout.slots) = {config.learner.n_steps} / ({config.rollout.shards} "
-            f"* {config.rollout.slots}) = {config.slot_length} steps per slot, less than the horizon of {config.env.id} "
-            f"({horizon}): no episode could end. Use fewer shards or slots, or larger updates"
+            f"* {config.rollout.slots}) = {config.slot_length} steps per slot, less than the horizon of "
+            f"{config.env.id} ({horizon}): no episode could end. Use fewer shards or slots, or larger updates"
         )
     curriculum = config.curriculum
     if curriculum.kind == "space" and not curriculum.allow_context_blind and len(train) > 1:
@@ -218,7 +218,7 @@ class _Run:
     iteration: int = 1
     rounds_left: int | None = None  # in this iteration; None until the selection is known
     version: int = 0  # of the selection being trained on
-    walk: Walk = Walk(-1, ())
+    walk: Walk = field(default_factory=lambda: Walk(-1, ()))
     rows: int = 0
     evaluated_at: int = -1  # steps
     rollouts: list[dict[str, float]] = field(default_factory=list)  # of this iteration's rounds
@@ -288,7 +288,7 @@ class Training:
     # ---- the parts of an iteration ----
 
     def _begin(self) -> Handle:
-        run, cluster = self._run, self._cluster
+        cluster = self._cluster
         weights = cluster.put(self.learner.weights(0))
         self._adopt(cluster.begin(cluster.start_values(weights)))
         self._evaluate(weights)
@@ -471,7 +471,8 @@ class Training:
         state, values = self._cluster.get([run.state, run.values])
         arrays["curriculum/values"] = values
         arrays["curriculum/selected"] = state.selected
-        numbers = {item.name: getattr(state, item.name) for item in dataclasses.fields(state) if item.name != "selected"}
+        fields = [item.name for item in dataclasses.fields(state) if item.name != "selected"]
+        numbers = {name: getattr(state, name) for name in fields}
         data = {
             "learner": learner,
             "curriculum": numbers,
@@ -547,6 +548,7 @@ def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int, total_
 
 
 def _checked(values: FloatArray) -> FloatArray:
+    """The values, if they are numbers. Raises SpaceDistError otherwise."""
     if not np.isfinite(values).all():
         raise SpaceDistError(
             f"training diverged: the start values of {int((~np.isfinite(values)).sum())} instances are not finite. "

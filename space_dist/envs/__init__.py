@@ -32,7 +32,7 @@ def make_batched(env_id: str, n_slots: int, *, context_visible: bool) -> Batched
     A function at an import path is called with the number of slots and returns a `BatchedEnv`.
     Raises ConfigError if there is no such environment.
     """
-    env = _find(env_id)(n_slots)
+    env: BatchedEnv = _find(env_id)(n_slots)
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
                if not hasattr(env, name)]  # fmt: skip
     if missing:
@@ -55,7 +55,16 @@ def _find(env_id: str) -> Callable[[int], Any]:
         raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {error}") from None
     if not callable(found):
         raise ConfigError(f"env.id {env_id!r}: {module_name!r} has no function {name!r}")
-    return found  # type: ignore[no-any-return]
+    made: Callable[[int], Any] = found
+    return made
 
 
-__all__ = ["BatchedEnv", "BatchedPointMass", "ContextObservation", "ContextVisible", "SingleEnv", "Step", "make_batched"]
+__all__ = [
+    "BatchedEnv",
+    "BatchedPointMass",
+    "ContextObservation",
+    "ContextVisible",
+    "SingleEnv",
+    "Step",
+    "make_batched",
+]

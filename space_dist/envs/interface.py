@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -35,14 +35,30 @@ class Step:
 
 
 class BatchedEnv(Protocol):
-    """`n_slots` independent copies. An episode is a pure function of (context, seed, actions): never of its slot,
-    of its neighbours, or of what ran before in it."""
+    """`n_slots` independent copies.
 
-    n_slots: int
-    horizon: int  # steps after which an episode is truncated
-    observation_space: spaces.Box  # of one slot
-    action_space: spaces.Space[NDArray[np.generic]]  # of one slot
-    context_bounds: ContextBounds
+    An episode is a pure function of (context, seed, actions): never of its slot, its neighbours, or what ran before.
+    """
+
+    @property
+    def n_slots(self) -> int:
+        """How many episodes run at once."""
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode is truncated."""
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """Of one slot."""
+
+    @property
+    def action_space(self) -> spaces.Space[Any]:
+        """Of one slot."""
+
+    @property
+    def context_bounds(self) -> ContextBounds:
+        """Names and bounds of a context's features."""
 
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
         """Start new episodes in `slots` (k,), with `contexts` (k, d) and `seeds` (k,); returns (k, obs_dim)."""

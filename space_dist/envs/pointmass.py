@@ -83,7 +83,7 @@ class BatchedPointMass:
         )
 
     def _hit_wall(self, path: FloatArray, gate_x: FloatArray, gate_width: FloatArray) -> NDArray[np.bool_]:
-        """Which slots crossed y = 0 outside their gate on `path` (inner steps + 1, 2, n_slots); they end at the wall."""
+        """Which slots crossed y = 0 outside their gate on `path` (inner + 1, 2, n_slots); they end at the wall."""
         y_before, y_after = path[:-1, 1], path[1:, 1]
         crossed = (y_before * y_after <= 0.0) & (y_before != y_after)
         crashed = np.zeros(self.n_slots, dtype=np.bool_)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from space_dist.envs.interface import MakeBatched
 
 
-class SingleEnv(gym.Env[NDArray[np.float32], Any]):
+class SingleEnv(gym.Env[Any, Any]):
     """Contexts come with `reset(options={"context": array})` and stay until another one is given.
 
     Without any, the context is drawn uniformly from `context_space` at each reset. The first call of `reset` without a
@@ -23,7 +23,7 @@ class SingleEnv(gym.Env[NDArray[np.float32], Any]):
 
     def __init__(self, make_batched: MakeBatched) -> None:
         self._env = make_batched(1)
-        self.observation_space = self._env.observation_space
+        self.observation_space: spaces.Box = self._env.observation_space
         self.action_space = self._env.action_space
         bounds = self._env.context_bounds
         self.context_space = spaces.Box(bounds.low, bounds.high, dtype=np.float64)

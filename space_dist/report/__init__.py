@@ -44,8 +44,11 @@ all their instances at once, and from which step on (median over those)."""
 
 @dataclass(frozen=True)
 class Report:
-    """What `build_report` wrote. `table` has one dict (column -> text) a configuration, with the same columns in all;
-    `remarks` are sentences that belong below it."""
+    """What `build_report` wrote.
+
+    `table` has one dict (column -> text) a configuration, with the same columns in all; `remarks` are sentences that
+    belong below it.
+    """
 
     table: list[dict[str, str]]
     remarks: list[str]

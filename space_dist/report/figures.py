@@ -45,9 +45,8 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
             "linestyle": LINE_STYLES[number // len(COLOURS) % len(LINE_STYLES)],
         }
         label = f"{configuration.label} ({_seed_count(configuration)})"
-        for axes, split in ((test, "test"), (train, "train")):
-            steps, returns = configuration.returns("test" if split == "test" else "train")
-            _draw_returns(axes, steps, returns, label, style)
+        _draw_returns(test, *configuration.returns("test"), label, style)
+        _draw_returns(train, *configuration.returns("train"), label, style)
         _draw_set_sizes(sizes, configuration, label, style)
     for axes, title, label in (
         (test, "Test instances", f"mean {_RETURN_LABEL}"),
@@ -57,8 +56,8 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
         _dress(axes, title, label)
     sizes.yaxis.set_major_locator(MaxNLocator(integer=True))
     sizes.set_ylim(bottom=0)
-    handles = [line for line in test.get_lines() if not line.get_label().startswith("_")]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles) or 1), frameon=False)
+    columns = min(3, len(configurations))
+    figure.legend(handles=test.get_lines(), loc="outside lower center", ncols=columns, frameon=False)
     return figure
 
 
@@ -176,7 +175,7 @@ def _dress(axes: Axes, title: str, label: str) -> None:
     axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    if not axes.has_data():
+    if not any(np.size(line.get_xdata()) for line in axes.get_lines()):
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", va="center", color="#777777")
 
 

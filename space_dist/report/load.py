@@ -23,6 +23,7 @@ IntArray = NDArray[np.int64]
 Split = Literal["test", "train"]
 
 MEASURES: Final = ("return", "discounted_return", "length", "success")
+SPLITS: Final[tuple[Split, ...]] = ("test", "train")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +98,8 @@ class Configuration:
 
     @property
     def drawn(self) -> tuple[Run, ...]:
-        """The runs whose curves are drawn: the finished ones; while there is none, every one that was evaluated."""
-        return self.finished or tuple(run for run in self.runs if len(run.evaluation_steps))
+        """The evaluated runs whose curves are drawn: the finished ones; while there is none, the unfinished."""
+        return tuple(run for run in self.finished or self.runs if len(run.evaluation_steps))
 
     def returns(self, split: Split) -> tuple[IntArray, FloatArray]:
         """`(k,)` real steps at which every drawn run was evaluated, and its `(runs, k)` mean undiscounted returns."""

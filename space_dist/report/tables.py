@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from space_dist.report.load import Configuration, Run, Split, fingerprint_differences, standing
+from space_dist.report.load import SPLITS, Configuration, Run, Split, fingerprint_differences, standing
 from space_dist.report.statistics import Estimate, estimate
 
 NONE = "—"
@@ -71,10 +71,10 @@ def remarks(configuration: Configuration) -> list[str]:
         lines.append(f"{label}, finished but without a final evaluation, not counted in the returns: "
                      f"{_seeds(unevaluated)}.")  # fmt: skip
     counted = [run for run in configuration.finished if run.evaluated_at_end]
-    for split in ("test", "train"):
-        if broken := [run for run in counted if math.isnan(run.final("test" if split == "test" else "train", "return"))]:
-            lines.append(f"{label}: the final {split} return is not a finite number for {_seeds(broken)}, so there is "
-                         "none over the seeds.")  # fmt: skip
+    for split in SPLITS:
+        broken = [run for run in counted if math.isnan(run.final(split, "return"))]
+        lines += [f"{label}: the final {split} return is not a finite number for {_seeds(broken)}, so there is none "
+                  "over the seeds."] if broken else []  # fmt: skip
     common = len(configuration.returns("test")[0])
     most = max((len(run.evaluation_steps) for run in configuration.drawn), default=0)
     if common < most:
