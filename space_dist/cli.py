@@ -27,6 +27,7 @@ from rich.table import Table
 from space_dist.errors import ConfigError, SpaceDistError
 
 if TYPE_CHECKING:
+    from space_dist.report import Report
     from space_dist.training import Progress
 
 app = typer.Typer(
@@ -40,6 +41,8 @@ app.add_typer(config_app, name="config")
 
 console = Console()
 errors = Console(stderr=True)
+
+_REPORT_WIDTH = 200  # characters
 
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders, or folders that hold some.")]
 Overrides = Annotated[
@@ -145,12 +148,27 @@ def report(
     from space_dist.ledger import find_ledgers
     from space_dist.report import build_report
 
-    result = build_report(find_ledgers(runs), out)
-    _print_report(result)
+    print_report(build_report(find_ledgers(runs), out), console)
 
 
-def _print_report(result: object) -> None:
-    raise NotImplementedError
+def print_report(result: Report, to: Console) -> None:
+    """Show a report's table, its caveats, and where the files are."""
+    # One block per configuration where the terminal is too narrow for a row of so many columns.
+    wide = to.width >= _REPORT_WIDTH
+    if wide:
+        table = Table()
+        for column in result.table[0]:
+            table.add_column(column)
+        for row in result.table:
+            table.add_row(*(text.replace("[", r"\[") for text in row.values()))
+    else:
+        table = Table("", *(row["configuration"] for row in result.table))
+        for column in list(result.table[0])[1:]:
+            table.add_row(column, *(row[column].replace("[", r"\[") for row in result.table))
+    to.print(table)
+    for remark in result.remarks:
+        to.print(remark, highlight=False, markup=False)
+    to.print(f"Figure and tables: {result.figure.parent}", highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -164,7 +182,26 @@ def sync(
     follow: Annotated[bool, typer.Option("--follow", help="Go on until the runs have ended.")] = False,
 ) -> None:
     """Replay runs into MLflow. Doing it twice changes nothing."""
-    raise NotImplementedError
+    from space_dist.ledger import find_ledgers
+    from space_dist.tracking import follow as follow_runs
+    from space_dist.tracking import sync as sync_runs
+
+    ledgers = find_ledgers(runs)
+    if follow:
+        result = follow_runs(
+            runs, uri, experiment, stop=lambda: not any(ledger.owner_alive() for ledger in ledgers)
+        )  # fmt: skip
+    else:
+        result = sync_runs(ledgers, uri, experiment)
+    console.print(
+        f"{result.runs} runs are up to date in MLflow ({result.created} new, {result.rows} rows pushed"
+        + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),
+        highlight=False,
+    )
+    for folder, reason in result.failed.items():
+        errors.print(f"space-dist: {folder} is not mirrored: {reason}", highlight=False, markup=False, soft_wrap=True)
+    if result.failed:
+        raise typer.Exit(1)
 
 
 @instances_app.command("sample")

@@ -182,7 +182,7 @@ class EvaluationConfig(_Section):
     """Deterministic evaluation on every training and test instance, on environments and seeds of its own."""
 
     every_steps: int | Literal["log"] = Field(default=10_000)
-    """Environment steps between evaluations; log: at 1e3, 3e3, 1e4, 3e4, ... Step 0 and the end are always evaluated."""
+    """Environment steps between evaluations; log: at 1e3, 3e3, 1e4, 3e4, ... Step 0 and the end are evaluated too."""
     episodes: int = Field(default=1, ge=1, le=1000)
     """Episodes per instance and evaluation, with the same seeds each time."""
 

@@ -1,0 +1,407 @@
+"""Reports from real ledgers: known answers, and nothing dropped in silence."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from space_dist.config import to_yaml
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Ledger, RunWriter, Status, find_ledgers
+from space_dist.report import (
+    bootstrap_interval,
+    build_report,
+    draw_comparison,
+    draw_curriculum,
+    draw_learning_curve,
+    estimate,
+    group,
+    interquartile_mean,
+    load_run,
+    summarise,
+)
+from space_dist.report.figures import curriculum_shares
+
+STARTED = 1_700_000_000.0
+STEPS = 1000  # of one iteration
+
+
+def start_run(
+    folder: Path, *, name: str = "space", seed: int = 0, n: int = 4, eta: float = 0.1, uri: str | None = None
+) -> Ledger:
+    """A run that was started and wrote nothing yet, as the launcher leaves it."""
+    config = {
+        "name": name,
+        "seed": seed,
+        "env": {"id": "space_dist/PointMass-v0", "context_visible": True},
+        "instances": {"train": "instances_train.csv", "test": "instances_test.csv"},
+        "curriculum": {"kind": "space", "eta": eta, "kappa": 1},
+        "learner": {"kind": "ppo", "net_arch": [64, 64], "target_kl": None},
+        "budget": {"steps": 4 * STEPS},
+        "checkpoint": {"every_rounds": 20},
+        "tracking": {"uri": uri, "experiment": "tests"},
+        "resources": {"workers": seed},
+    }
+    train, test = ("".join(f"{i},{i + offset}.5\n" for i in range(n)) for offset in (0, 100))
+    with RunWriter(Ledger(folder)) as writer:
+        writer.write_config(to_yaml(config), f"id,gate\n{train}", f"id,gate\n{test}")
+        writer.set_status(
+            Status("running", name, seed, 0, 4 * STEPS, 0, STARTED + seed, STARTED + seed,
+                   fingerprint={"cpu": "test", "torch": "2.0"})  # fmt: skip
+        )
+    return Ledger(folder)
+
+
+def continue_run(
+    ledger: Ledger,
+    test: Sequence[float | None],
+    trained: Sequence[Sequence[int]],
+    *,
+    train: Sequence[float | None] | None = None,
+    until: int | None = None,
+    state: str = "done",
+    success: float | None = None,
+    message: str | None = None,
+) -> None:
+    """Append the iterations up to number `until`, each with the evaluation after it, and commit them.
+
+    `test` has one return more than there are iterations: the evaluation at step 0.
+    """
+    until = len(trained) if until is None else until
+    before = ledger.status()
+    with RunWriter(ledger) as writer:
+        checkpoint = writer.restore()
+        writer.status = before
+        done = checkpoint.round if checkpoint else 0
+        numbers = list(range(done + 1, until + 1)) if checkpoint else list(range(until + 1))
+        n_rows = len(ledger.rows(METRICS))
+
+        def add(row: dict[str, Any]) -> None:
+            nonlocal n_rows
+            writer.append(METRICS, row)
+            time = before.started_at + 1.25 * n_rows
+            rate = None if row["steps"] == 0 else 800.0
+            writer.append(TIMING, {"row": n_rows, "unix_time": time, "seconds": 1.25, "steps_per_second": rate})
+            n_rows += 1
+
+        for number in numbers:
+            position = {"iteration": number, "round": number, "steps": number * STEPS}
+            if number:
+                writer.append(CURRICULUM, {"iteration": number, "steps": number * STEPS,
+                                           "trained": list(trained[number - 1])})  # fmt: skip
+                size = len(trained[number - 1])
+                numbers_ = {"size": len(trained[min(number, len(trained) - 1)]), "trained_size": size, "grew": True,
+                            "mean_value_before": -0.5, "mean_value_after": None}  # fmt: skip
+                add({"kind": "iteration", **position, "complete": True, "episodes": 20, "episodes_cut": 3,
+                     "rollout": {"return": -9.0 + number, "discounted_return": None, "length": 50.0, "success": None},
+                     "learner": {"loss": 1.0 / number, "clip_fraction": 0.25}, "curriculum": numbers_})  # fmt: skip
+            evaluated = {}
+            for split, returns in (("train", test if train is None else train), ("test", test)):
+                value = returns[number]
+                evaluated[split] = {"return": value, "discounted_return": value, "length": 40.0, "success": success,
+                                    "returns": [value] * 4}  # fmt: skip
+            add({"kind": "evaluation", **position, **evaluated})
+        status = dataclasses.replace(
+            before, state=state, steps=until * STEPS, round=until, message=message,
+            updated_at=before.started_at + 1.25 * n_rows,
+        )  # fmt: skip
+        writer.commit(Checkpoint(until, {"weights": np.zeros(3)}, {}), dataclasses.replace(status, state="running"))
+        if state == "done":
+            writer.write_model({"weights": np.arange(3.0)}, {"kind": "mlp"})
+            ledger.log.write_text("done\n")
+        writer.set_status(status)
+
+
+GROWTH = ([2], [0, 2], [0, 1, 2, 3], [0, 1, 2, 3])
+
+
+def finished_run(folder: Path, final: float | None, **settings: Any) -> Ledger:
+    ledger = start_run(folder, **settings)
+    continue_run(ledger, [-10.0, -8.0, -6.0, -4.0, final], GROWTH, success=0.5)
+    return ledger
+
+
+# ---- statistics -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "answer"),
+    [
+        ([5.0], 5.0),
+        ([1.0, 2.0, 6.0], 3.0),  # a quarter of three is no whole value: the plain mean
+        ([100.0, 1.0, 3.0, -50.0], 2.0),  # of -50, 1, 3, 100 the middle two
+        ([9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 70.0], 4.5),  # 3, 4, 5, 6
+        ([1.0, np.nan, 2.0, 3.0, 4.0], np.nan),
+    ],
+)
+def test_the_interquartile_mean_is_that_of_the_middle_half(values: list[float], answer: float) -> None:
+    np.testing.assert_equal(interquartile_mean(np.array(values)), answer)
+
+
+def test_the_interval_is_that_of_every_possible_resample() -> None:
+    """Two seeds 0 and 1: the resampled mean is 0, 1/2 or 1 with chances 1/4, 1/2, 1/4, so the 95 % are all of it.
+    Eleven values: against an independent implementation of the percentile bootstrap."""
+    assert [float(bound) for bound in bootstrap_interval(np.array([0.0, 1.0]))] == [0.0, 1.0]
+
+    values = np.array([3.0, -1.0, 4.0, 1.0, -5.0, 9.0, 2.0, 6.0, -5.0, 3.0, 5.0])
+    draws = np.random.default_rng(1).choice(values, (20_000, 11))
+    middle = np.sort(draws, axis=1)[:, 2:-2].mean(axis=1)
+    low, high = bootstrap_interval(values)
+    np.testing.assert_allclose([low, high], np.quantile(middle, [0.025, 0.975]), atol=0.15)
+    assert low < interquartile_mean(values) < high
+
+
+def test_the_interval_is_the_same_in_every_call_and_place() -> None:
+    curves = np.array([[1.0, 2.0, 1.0], [4.0, 5.0, 4.0], [3.0, 9.0, 3.0]])
+    low, high = bootstrap_interval(curves)
+    assert low.shape == high.shape == (3,)
+    assert (low[0], high[0]) == (low[2], high[2])
+    assert float(bootstrap_interval(curves[:, 1])[0]) == low[1]
+
+
+def test_one_seed_has_no_interval_and_none_no_number() -> None:
+    one, none = estimate(np.array([2.0])), estimate(np.array([]))
+    assert (one.iqm, one.mean, one.median, one.low, one.high) == (2.0, 2.0, 2.0, None, None)
+    assert none.n == 0
+    assert np.isnan(none.iqm)
+
+
+# ---- the report -----------------------------------------------------------------------------------------------------
+
+
+def test_two_configurations_of_three_seeds(tmp_path: Path) -> None:
+    for seed, final in enumerate((1.0, 2.0, 6.0)):
+        finished_run(tmp_path / f"space/s{seed}", final, seed=seed)
+        finished_run(tmp_path / f"robin/s{seed}", final - 10.0, seed=seed, name="round_robin")
+    report = build_report(find_ledgers([tmp_path]), tmp_path / "out/deep")
+
+    assert [row["configuration"] for row in report.table] == ["round_robin", "space"]
+    space = report.table[1]
+    assert space == {
+        "configuration": "space",
+        "seeds finished": "3/3",
+        "environment steps": "4,000",
+        "test return, IQM [95 %]": "3.000 [1.000, 6.000]",
+        "test return, mean": "3.000",
+        "test return, median": "2.000",
+        "train return, IQM [95 %]": "3.000 [1.000, 6.000]",
+        "test success": "0.500",
+        "set size at the end": "4 of 4",
+        "all instances reached": "3/3 at 2,000 steps",
+    }
+    assert report.remarks == []
+    assert report.figure.read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "out/deep/report.md").read_text() == report.markdown
+    assert "| space | 3/3 | 4,000 | 3.000 [1.000, 6.000] |" in report.markdown
+    with (tmp_path / "out/deep/report.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["test_return_iqm"]) for row in rows] == [-7.0, 3.0]
+    assert [row["all_instances_reached_at"] for row in rows] == ["2000.0", "2000.0"]
+
+
+def test_what_is_drawn_is_what_was_measured(tmp_path: Path) -> None:
+    ledgers = [finished_run(tmp_path / f"s{seed}", final, seed=seed) for seed, final in enumerate((1.0, 2.0, 6.0))]
+    late = start_run(tmp_path / "s3", seed=3)
+    continue_run(late, [50.0, 50.0], [[0]], state="interrupted")
+    figure = draw_comparison(group([load_run(ledger) for ledger in [*ledgers, late]]))
+    test, train, sizes = figure.axes
+
+    (line,) = test.get_lines()
+    assert line.get_label() == "space (3 of 4 seeds)"
+    np.testing.assert_array_equal(line.get_xdata(), [0, 1000, 2000, 3000, 4000])
+    np.testing.assert_array_equal(line.get_ydata(), [-10, -8, -6, -4, 3])
+    band = test.collections[0].get_paths()[0].vertices
+    assert band[band[:, 0] == 4000][:, 1].min() == 1.0
+    assert band[band[:, 0] == 4000][:, 1].max() == 6.0
+    np.testing.assert_array_equal(train.get_lines()[0].get_ydata(), [-10, -8, -6, -4, 3])
+
+    *seeds, median = sizes.get_lines()
+    assert len(seeds) == 3
+    np.testing.assert_array_equal(median.get_xdata(), [0, 1000, 2000, 3000, 4000])
+    np.testing.assert_array_equal(median.get_ydata(), [1, 2, 4, 4, 4])
+
+
+def test_set_sizes_are_held_between_their_changes(tmp_path: Path) -> None:
+    """Two seeds that grow at different steps: 1, 2, 3 and 3, 3, 4 instances, so a median of 2, 2.5, 3.5."""
+    for seed, trained in enumerate(([[0], [0, 1], [0, 1, 2]], [[1, 2, 3], [1, 2, 3], [0, 1, 2, 3]])):
+        continue_run(start_run(tmp_path / f"s{seed}", seed=seed), [0.0] * 4, trained)
+    (configuration,) = group([load_run(ledger) for ledger in find_ledgers([tmp_path])])
+    median = draw_comparison([configuration]).axes[2].get_lines()[-1]
+    np.testing.assert_array_equal(median.get_ydata(), [2.0, 2.5, 3.5, 3.5])
+
+    summary = summarise(configuration)
+    assert (summary.set_size, summary.n_instances, summary.reached, summary.reached_at) == (3.5, 4, 1, 2000)
+
+
+def test_unfinished_runs_are_shown_and_not_counted(tmp_path: Path) -> None:
+    finished_run(tmp_path / "s0", 1.0, seed=0)
+    continue_run(start_run(tmp_path / "s1", seed=1), [99.0] * 3, GROWTH[:2], state="failed", message="worker died\n...")
+    start_run(tmp_path / "s2", seed=2)
+    report = build_report(find_ledgers([tmp_path]), tmp_path / "out")
+
+    (row,) = report.table
+    assert row["seeds finished"] == "1/3"
+    assert row["test return, IQM [95 %]"] == "1.000 [—]"
+    (remark,) = report.remarks
+    assert "seed 1 failed at 2,000 of 4,000 steps (worker died);" in remark
+    assert "seed 2 left behind by a process that is gone at 0 of 4,000 steps" in remark
+    assert remark in report.markdown
+
+
+def test_runs_without_any_row_make_a_report(tmp_path: Path) -> None:
+    report = build_report([start_run(tmp_path / "s0")], tmp_path / "out")
+    assert report.table[0]["seeds finished"] == "0/1"
+    assert report.table[0]["test return, IQM [95 %]"] == "—"
+    assert report.figure.exists()
+
+
+def test_a_running_run_is_drawn_while_nothing_has_finished(tmp_path: Path) -> None:
+    ledger = start_run(tmp_path / "s0")
+    continue_run(ledger, [0.0, 1.0, 2.0], GROWTH[:2], state="interrupted")
+    figure = draw_comparison(group([load_run(ledger)]))
+    assert figure.axes[0].get_lines()[0].get_label() == "space (1 seed, unfinished)"
+
+
+def test_evaluations_that_not_every_seed_has_are_left_out_and_named(tmp_path: Path) -> None:
+    finished_run(tmp_path / "s0", 1.0, seed=0)
+    short = start_run(tmp_path / "s1", seed=1)
+    continue_run(short, [-10.0, -8.0, -6.0], GROWTH[:2])
+    report = build_report(find_ledgers([tmp_path]), tmp_path / "out")
+    assert report.table[0]["environment steps"] == "3,000 (2,000–4,000)"
+    assert any("3 of up to 5 evaluations" in remark for remark in report.remarks)
+
+
+def test_a_final_return_that_is_no_number_is_not_averaged_away(tmp_path: Path) -> None:
+    for seed, final in enumerate((1.0, 2.0, None, 3.0, 4.0)):
+        finished_run(tmp_path / f"s{seed}", final, seed=seed)
+    report = build_report(find_ledgers([tmp_path]), tmp_path / "out")
+    assert report.table[0]["test return, IQM [95 %]"] == "—"
+    assert any("test return is not a finite number for seed 2" in remark for remark in report.remarks)
+
+
+def test_the_same_seed_twice_is_refused(tmp_path: Path) -> None:
+    one, two = finished_run(tmp_path / "a", 1.0, seed=7), finished_run(tmp_path / "b", 1.0, seed=7)
+    with pytest.raises(ConfigError, match="seed 7 of space is there twice") as refusal:
+        build_report([one, two], tmp_path / "out")
+    assert str(one.folder) in str(refusal.value)
+    assert str(two.folder) in str(refusal.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_configurations_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    finished_run(tmp_path / "a", 1.0, eta=0.1)
+    finished_run(tmp_path / "b", 1.0, eta=0.2)
+    finished_run(tmp_path / "c", 1.0, eta=0.2, n=5, seed=1)  # other instances: another configuration too
+    labels = [row["configuration"] for row in build_report(find_ledgers([tmp_path]), tmp_path / "out").table]
+    assert len(set(labels)) == 3
+    assert all(label.startswith("space ") for label in labels)
+
+
+def test_resources_and_tracking_do_not_make_another_configuration(tmp_path: Path) -> None:
+    for seed in range(2):
+        finished_run(tmp_path / f"s{seed}", 1.0, seed=seed, uri=f"http://host{seed}:1")
+    (configuration,) = group([load_run(ledger) for ledger in find_ledgers([tmp_path])])
+    assert configuration.label == "space"
+
+
+def test_runs_of_other_code_are_named(tmp_path: Path) -> None:
+    finished_run(tmp_path / "s0", 1.0, seed=0)
+    other = finished_run(tmp_path / "s1", 1.0, seed=1)
+    with RunWriter(other) as writer:
+        writer.status = other.status()
+        fingerprint = {"cpu": "test", "torch": "2.1"}
+        writer.set_status(dataclasses.replace(writer.status, fingerprint=fingerprint, fingerprint_changed=True))
+    remarks = build_report(find_ledgers([tmp_path]), tmp_path / "out").remarks
+    assert "space: its runs differ in torch: 2.0, 2.1." in remarks
+    assert any("resumed with another CPU model or other library versions: seed 1" in remark for remark in remarks)
+
+
+def test_no_runs_and_nowhere_to_write_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no runs"):
+        build_report([], tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot be written"):
+        build_report([start_run(tmp_path / "s0")], tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("config.yaml", "a: [", "not valid YAML"),
+        ("config.yaml", "just words", "no keys and values"),
+        ("instances_train.csv", "id,x\nfirst,1.0\n", "not every row has an id"),
+        ("metrics.jsonl", "{}\n", "row 1: damaged"),
+    ],
+)
+def test_damage_is_named(tmp_path: Path, file: str, content: str, message: str) -> None:
+    ledger = start_run(tmp_path / "s0")
+    (ledger.folder / file).write_text(content)
+    with pytest.raises(LedgerError, match=message):
+        load_run(ledger)
+
+
+# ---- the figures of one run -----------------------------------------------------------------------------------------
+
+
+def test_the_learning_curve_of_a_run(tmp_path: Path) -> None:
+    ledger = start_run(tmp_path / "s0")
+    with pytest.raises(LedgerError, match="no evaluation yet"):
+        draw_learning_curve(load_run(ledger))
+    continue_run(ledger, [-3.0, -2.0, -1.0], GROWTH[:2], train=[1.0, 2.0, None])
+    returns, sizes = draw_learning_curve(load_run(ledger)).axes
+    test, train = returns.get_lines()
+    assert (test.get_label(), train.get_label()) == ("test", "train")
+    np.testing.assert_array_equal(test.get_xdata(), [0, 1000, 2000])
+    np.testing.assert_array_equal(test.get_ydata(), [-3, -2, -1])
+    np.testing.assert_array_equal(train.get_ydata(), [1, 2, np.nan])
+    np.testing.assert_array_equal(sizes.get_lines()[0].get_ydata(), [1, 2, 2])
+
+
+def arrays(*trained: Sequence[int]) -> list[np.ndarray[tuple[int], np.dtype[np.int64]]]:
+    return [np.array(ids, dtype=np.int64) for ids in trained]
+
+
+def test_the_map_of_a_curriculum_by_hand() -> None:
+    """Ids 3, 5, 7, 9, 11. First included: 7 in iteration 1, 3 and 9 in 2 (a tie: by id), 5 in 3, 11 never."""
+    ids = np.array([3, 5, 7, 9, 11])
+    order, shares = curriculum_shares(arrays([7], [9, 7, 3], [5, 9, 9]), ids)
+    assert order.tolist() == [7, 3, 9, 5, 11]
+    np.testing.assert_array_equal(shares, [[1, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1], [0, 0, 0]])
+
+
+def test_a_large_map_shows_the_mean_of_each_block() -> None:
+    """The same five instances in blocks of two (rows 7+3, 9+5, 11) and three iterations in blocks of two."""
+    ids = np.array([3, 5, 7, 9, 11])
+    order, shares = curriculum_shares(arrays([7], [9, 7, 3], [5, 9, 9]), ids, max_rows=3, max_columns=2)
+    assert order.tolist() == [7, 3, 9, 5, 11]
+    np.testing.assert_array_equal(shares, [[0.75, 0.0], [0.25, 1.0], [0.0, 0.0]])
+
+
+def test_an_id_that_is_no_instance_is_refused() -> None:
+    for foreign in (-1, 4, 12):
+        with pytest.raises(LedgerError, match="iteration 1"):
+            curriculum_shares(arrays([foreign]), np.array([3, 5]))
+
+
+def test_the_heat_map_of_a_run(tmp_path: Path) -> None:
+    run = load_run(finished_run(tmp_path / "s0", 1.0))
+    axes = draw_curriculum(run).axes[0]
+    np.testing.assert_array_equal(
+        np.asarray(axes.images[0].get_array()), [[1, 1, 1, 1], [0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 1, 1]]
+    )
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["2", "0", "1", "3"]
+
+
+def test_generated_contexts_have_no_map(tmp_path: Path) -> None:
+    ledger = start_run(tmp_path / "s0")
+    continue_run(ledger, [0.0, 0.0], [[-1, -1, -1, -1]])
+    run = load_run(ledger)
+    assert run.all_instances_reached_at is None
+    with pytest.raises(ConfigError, match="generated contexts"):
+        draw_curriculum(run)
+    assert build_report([ledger], tmp_path / "out").table[0]["set size at the end"] == "—"

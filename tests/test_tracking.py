@@ -1,0 +1,299 @@
+"""MLflow as a mirror, on real SQLite stores: everything once, whatever happened in between."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import mlflow
+import pytest
+from mlflow import MlflowClient
+from mlflow.entities import Run
+from space_dist.errors import ConfigError
+from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
+from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, follow, sync
+from test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
+
+TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database with MLflow's tables: making them takes seconds, so it happens once."""
+    folder = tmp_path_factory.mktemp("store")
+    sync([start_run(folder / "run")], f"sqlite:///{folder / 'mlflow.db'}", "unused")
+    return folder / "mlflow.db"
+
+
+@pytest.fixture
+def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A store of the test's own, in a folder whose name needs care, and a current folder that must stay empty."""
+    store = tmp_path / "a store #1"
+    store.mkdir()
+    shutil.copy(empty_store, store / "mlflow.db")
+    (tmp_path / "cwd").mkdir()
+    monkeypatch.chdir(tmp_path / "cwd")
+    return f"sqlite:///{store / 'mlflow.db'}"
+
+
+def only_run(uri: str, experiment: str = "tests") -> Run:
+    client = MlflowClient(uri)
+    found = client.get_experiment_by_name(experiment)
+    assert found is not None
+    (run,) = client.search_runs([found.experiment_id])
+    return run
+
+
+def histories(uri: str, run: Run) -> dict[str, list[tuple[int, int, float]]]:
+    """Every point of every metric: name -> (step, milliseconds, value), sorted."""
+    client = MlflowClient(uri)
+    return {
+        name: sorted((p.step, p.timestamp, p.value) for p in client.get_metric_history(run.info.run_id, name))
+        for name in run.data.metrics
+    }
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_finished_run_is_mirrored_whole_and_once(uri: str, tmp_path: Path) -> None:
+    ledger = finished_run(tmp_path / "run", 1.0, seed=3, uri=uri)
+    before = contents(ledger.folder)
+    result = sync([ledger])
+    assert (result.runs, result.created, result.rows, result.skipped, result.failed) == (1, 1, 9, 0, {})
+
+    run = only_run(uri)
+    assert run.info.run_name == "space-s3"
+    assert (run.info.status, run.info.start_time) == ("FINISHED", round((STARTED + 3) * 1000))
+    assert run.info.end_time == round(ledger.status().updated_at * 1000)
+    assert run.data.params["curriculum.eta"] == "0.1"
+    assert run.data.params["learner.net_arch"] == "[64, 64]"
+    tags = run.data.tags
+    assert (tags["space_dist.seed"], tags["space_dist.state"]) == ("3", "done")
+    assert (tags["space_dist.fingerprint.torch"], tags[ROWS_TAG]) == ("2.0", "9")
+    assert "4,000 of 4,000 environment steps" in tags["mlflow.note.content"]
+    assert "test return at the end: 1, success 0.5" in tags["mlflow.note.content"]
+
+    points = histories(uri, run)
+    start = STARTED + 3
+    times = [round((start + 1.25 * row["row"]) * 1000) for row in ledger.rows(TIMING)]
+    expected = [(number * STEPS, times[2 * number], value) for number, value in enumerate(TEST)]
+    assert points["test/return"] == points["train/return"] == expected
+    assert points["learner/loss"] == [(n * STEPS, times[2 * n - 1], 1.0 / n) for n in range(1, 5)]
+    assert [value for _, _, value in points["curriculum/trained_size"]] == [1, 2, 4, 4]
+    assert {value for _, _, value in points["curriculum/grew"]} == {1.0}
+    assert {name for name in points if "/" not in name} == {"episodes", "episodes_cut", "iteration", "round"}
+    assert not {"rollout/success", "curriculum/mean_value_after", "test/returns"} & set(points)
+
+    again = sync([ledger])
+    assert (again.runs, again.created, again.rows) == (1, 0, 0)
+    repeated = only_run(uri)
+    assert histories(uri, repeated) == points
+    assert repeated.to_dictionary() == run.to_dictionary()
+    assert contents(ledger.folder) == before
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_the_artifacts_of_a_finished_run(uri: str, tmp_path: Path) -> None:
+    ledger = finished_run(tmp_path / "run", 1.0, uri=uri)
+    sync([ledger])
+    folder = tmp_path / "a store #1" / "mlartifacts" / only_run(uri).info.run_id / "artifacts"
+    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == {
+        "config.yaml", "instances_train.csv", "instances_test.csv", "model.npz", "model.json", "metrics.jsonl",
+        "log.txt", "figures/learning_curve.png", "figures/curriculum.png",
+    }  # fmt: skip
+    assert (folder / "model.npz").read_bytes() == ledger.model_arrays.read_bytes()
+    assert (folder / "figures/curriculum.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_rows_that_come_later_are_added_once_each(uri: str, tmp_path: Path) -> None:
+    whole = finished_run(tmp_path / "whole", 1.0, seed=1)
+    ledger = start_run(tmp_path / "run", seed=1, uri=uri)
+    assert sync([ledger]).rows == 0
+    assert only_run(uri).info.status == "KILLED"  # it says running, but nobody works on it
+    continue_run(ledger, TEST, GROWTH, until=2, state="interrupted", success=0.5)
+    assert sync([ledger]).rows == 5
+    assert only_run(uri).info.status == "KILLED"
+    assert [step for step, _, _ in histories(uri, only_run(uri))["test/return"]] == [0, 1000, 2000]
+
+    with RunWriter(ledger) as writer:  # rows behind the last checkpoint are not mirrored, and a live run runs
+        writer.status = ledger.status()
+        writer.set_status(dataclasses.replace(writer.status, state="running"))
+        writer.append(METRICS, {"kind": "evaluation", "steps": 999})
+        assert sync([ledger]).rows == 0
+        assert only_run(uri).info.status == "RUNNING"
+
+    continue_run(ledger, TEST, GROWTH, success=0.5)
+    assert sync([ledger]).rows == 4
+    assert only_run(uri).info.status == "FINISHED"
+    sync([whole], uri, "at once")
+    assert histories(uri, only_run(uri)) == histories(uri, only_run(uri, "at once"))
+
+
+def test_a_death_between_rows_and_their_tag_doubles_nothing(uri: str, tmp_path: Path) -> None:
+    ledger = finished_run(tmp_path / "run", 1.0, uri=uri)
+    sync([ledger])
+    points, run = histories(uri, only_run(uri)), only_run(uri)
+    for found in ("4", "nonsense"):
+        MlflowClient(uri).set_tag(run.info.run_id, ROWS_TAG, found)
+        sync([ledger])
+        assert histories(uri, only_run(uri)) == points
+        assert only_run(uri).data.tags[ROWS_TAG] == "9"
+
+
+def test_more_rows_than_one_call_takes(uri: str, tmp_path: Path) -> None:
+    ledger = start_run(tmp_path / "run", uri=uri)
+    many = 130  # iterations of 11 points and evaluations of 6 and 7: more than 2,000 points
+    continue_run(ledger, [float(n) for n in range(many + 1)], [[0]] * many, state="interrupted")
+    assert sync([ledger]).rows == 2 * many + 1
+    points = histories(uri, only_run(uri))
+    assert sum(len(history) for history in points.values()) > 2000
+    assert [value for _, _, value in points["test/return"]] == [float(n) for n in range(many + 1)]
+    assert len(points["learner/loss"]) == many
+
+
+def test_params_that_a_death_left_out_are_completed(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ledger = start_run(tmp_path / "run", uri=uri)
+
+    def die(*_: Any, **__: Any) -> None:
+        raise ConnectionError("cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MlflowClient, "log_batch", die)
+        with pytest.raises(TrackingError, match="cut"):
+            sync([ledger])
+    assert only_run(uri).data.params == {}
+    sync([ledger])
+    assert only_run(uri).data.params["learner.kind"] == "ppo"
+
+
+@pytest.mark.parametrize(("state", "status"), [("failed", "FAILED"), ("interrupted", "KILLED")])
+def test_an_end_is_told_truthfully(uri: str, tmp_path: Path, state: str, status: str) -> None:
+    ledger = start_run(tmp_path / "run", uri=uri)
+    continue_run(ledger, [0.0, 1.0], [[0]], state=state, message="out of memory")
+    sync([ledger])
+    run = only_run(uri)
+    assert run.info.status == status
+    assert run.info.end_time == round(ledger.status().updated_at * 1000)
+    assert "out of memory" in run.data.tags["mlflow.note.content"]
+
+
+def test_a_run_is_found_by_its_folder_and_start(uri: str, tmp_path: Path) -> None:
+    ledger = finished_run(tmp_path / "run", 1.0)
+    sync([Ledger(tmp_path / "cwd/../run")], uri, "tests")
+    text = f"{ledger.folder.resolve()}\n{STARTED!r}"
+    assert only_run(uri).data.tags[RUN_TAG] == hashlib.sha256(text.encode()).hexdigest()[:32]
+    shutil.rmtree(ledger.folder)
+    with RunWriter(start_run(ledger.folder)) as writer:  # another run in the same folder
+        writer.set_status(dataclasses.replace(ledger.status(), started_at=STARTED + 99))
+    assert sync([ledger], uri, "tests").created == 1
+
+
+def test_runs_without_a_uri_are_skipped_and_damaged_ones_named(uri: str, tmp_path: Path) -> None:
+    good, none, bad = (start_run(tmp_path / name, uri=own) for name, own in (("a", uri), ("b", None), ("c", uri)))
+    bad.config.write_text("[")
+    result = sync([bad, none, good])
+    assert (result.runs, result.skipped, list(result.failed)) == (1, 1, [bad.folder])
+    assert "not valid YAML" in result.failed[bad.folder]
+
+
+def test_what_mlflow_refuses_of_one_run_does_not_stop_the_others(uri: str, tmp_path: Path) -> None:
+    bad, good = start_run(tmp_path / "a", uri=uri), start_run(tmp_path / "b", seed=1, uri=uri)
+    bad.config.write_text(bad.config.read_text() + "\n'what?': 1\n")
+    result = sync([bad, good])
+    assert result.runs == 1
+    assert "refuses it" in result.failed[bad.folder]
+
+
+def test_a_dead_server_costs_nothing(tmp_path: Path) -> None:
+    ledger = finished_run(tmp_path / "run", 1.0)
+    before = contents(tmp_path)
+    with pytest.raises(TrackingError, match=r"http://127\.0\.0\.1:9 cannot be written to.*Nothing is lost"):
+        sync([ledger], "http://127.0.0.1:9", "tests")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "store", ["file:///tmp/mlruns", "mlruns", "/tmp/mlruns", "", "sqlite://", "sqlite:///:memory:", "sqlite:mlflow.db",
+              "postgresql://user:word@host/db", "http://user:word@host:5000", "http://[", "databricks"]
+)  # fmt: skip
+def test_other_stores_are_refused(tmp_path: Path, store: str) -> None:
+    with pytest.raises(ConfigError, match=r"sqlite:////absolute|MLFLOW_TRACKING_PASSWORD") as refusal:
+        sync([start_run(tmp_path / "run")], store, "tests")
+    assert "word@" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("content", [b"this is no database" * 100, None])
+def test_a_file_that_is_no_database_is_said_so(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "mlflow.db"
+    path.mkdir() if content is None else path.write_bytes(content)
+    with pytest.raises(TrackingError, match="cannot be written to"):
+        sync([start_run(tmp_path / "run")], f"sqlite:///{path}", "tests")
+
+
+def test_a_deleted_experiment_is_refused(uri: str, tmp_path: Path) -> None:
+    ledger = start_run(tmp_path / "run", uri=uri)
+    sync([ledger])
+    MlflowClient(uri).delete_experiment(only_run(uri).info.experiment_id)
+    with pytest.raises(ConfigError, match="was deleted"):
+        sync([ledger])
+
+
+def test_following_picks_up_runs_and_rows_as_they_come(uri: str, tmp_path: Path) -> None:
+    root, ledger = tmp_path / "runs", Ledger(tmp_path / "runs/s0")
+    events = iter(
+        [
+            lambda: None,  # no run yet: not even the folder
+            lambda: start_run(ledger.folder, uri=uri),
+            lambda: continue_run(ledger, TEST, GROWTH, until=2, state="interrupted"),
+            lambda: continue_run(ledger, TEST, GROWTH),
+        ]
+    )
+
+    def stop() -> bool:
+        event = next(events, None)
+        if event is not None:
+            event()
+        return event is None
+
+    result = follow(root, poll_seconds=0.0, stop=stop)
+    assert (result.runs, result.created, result.rows) == (1, 1, 9)
+    assert only_run(uri).info.status == "FINISHED"
+    assert len(histories(uri, only_run(uri))["test/return"]) == 5
+
+
+def test_following_says_once_that_the_store_is_away_and_once_that_it_is_back(
+    uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    start_run(tmp_path / "runs/s0")
+    database, away = Path(uri.removeprefix("sqlite:///")), tmp_path / "away.db"
+    database.rename(away)
+    database.mkdir()
+    calls = 0
+
+    def stop() -> bool:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            database.rmdir()
+            away.rename(database)
+        return calls == 6
+
+    with caplog.at_level(logging.WARNING, logger="space_dist.tracking"):
+        follow(tmp_path / "runs", uri, "tests", poll_seconds=0.0, stop=stop)
+    first, second = (record.getMessage() for record in caplog.records if record.name == "space_dist.tracking")
+    assert "Nothing is lost" in first
+    assert "reached again" in second
+    assert only_run(uri).info.run_name == "space-s0"
+
+
+def test_mlflow_keeps_its_own_settings(uri: str, tmp_path: Path) -> None:
+    before = mlflow.get_tracking_uri()
+    sync([start_run(tmp_path / "run")], uri, "tests")
+    assert mlflow.get_tracking_uri() == before
+    assert mlflow.active_run() is None
