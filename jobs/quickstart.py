@@ -4,10 +4,11 @@ One private Ray serves all runs; as many runs train at a time as there are cores
 it goes on where it stopped.
 """
 
+# ruff: noqa: E402 - Ray reads the environment when it is imported
 from __future__ import annotations
 
+import logging
 import os
-import secrets
 import shlex
 import signal
 import subprocess
@@ -16,7 +17,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
+from space_dist.launch import private_ray
+
+private_ray()  # before Ray is imported
 
 import ray
 from rich.console import Console
@@ -60,7 +63,8 @@ class Run:
     def start(self, address: str) -> None:
         """Start or resume it."""
         settings = {**SETTINGS, **(SPACE_SETTINGS if self.curriculum == "space" else {}), "resources.address": address}
-        command = [sys.executable, "-m", "space_dist.cli", "train", str(ROOT / f"configs/pointmass_{self.curriculum}.yaml")]
+        config = ROOT / f"configs/pointmass_{self.curriculum}.yaml"
+        command = [sys.executable, "-m", "space_dist.cli", "train", str(config)]
         command += ["--seed", str(self.seed), "--workers", "1", "--out", str(self.ledger.folder), "--resume"]
         for key, value in settings.items():
             command += ["--set", f"{key}={value}"]
@@ -83,7 +87,7 @@ class Run:
 
 def train_all(runs: list[Run], bar: Progress, address: str) -> list[Run]:
     """Train them, as many at a time as there are cores; returns the ones that failed."""
-    waiting, running, failed = list(runs), [], []
+    waiting, running, failed = list(runs), list[Run](), list[Run]()
     slots = max(1, len(os.sched_getaffinity(0)))
     while waiting or running:
         while waiting and len(running) < slots:
@@ -105,14 +109,18 @@ def main() -> int:
     console.print(f"SPaCE and round robin on PointMass: {len(SEEDS)} seeds each, {STEPS:,} environment steps a run")
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[line]}"))
     with Progress(*columns, TimeElapsedColumn(), console=console) as bar:
+
+        def add(curriculum: str, seed: int) -> TaskID:
+            return bar.add_task(f"{curriculum:<11} seed {seed}", total=STEPS, line="")
+
         runs = [
-            Run(name, seed, Ledger(folder / name / f"s{seed}"), bar.add_task(f"{name:<11} seed {seed}", total=STEPS, line=""))
+            Run(curriculum, seed, Ledger(folder / curriculum / f"s{seed}"), add(curriculum, seed))
             for seed in SEEDS
-            for name in CURRICULA
+            for curriculum in CURRICULA
         ]
         ray.init(
             address="local", num_cpus=2 * len(runs), include_dashboard=False, log_to_driver=False,
-            logging_level="ERROR", configure_logging=False, object_store_memory=256 << 20,
+            logging_level=logging.ERROR, configure_logging=False, object_store_memory=256 << 20,
         )  # fmt: skip
         try:
             failed = train_all(runs, bar, ray.get_runtime_context().gcs_address)
@@ -124,7 +132,8 @@ def main() -> int:
             ray.shutdown()
     if failed:
         for run in failed:
-            console.print(f"{run.curriculum}, seed {run.seed} failed: see {run.ledger.folder / 'output.txt'}", style="red")
+            log = run.ledger.folder / "output.txt"
+            console.print(f"{run.curriculum}, seed {run.seed} failed: see {log}", style="red")
         console.print("`make quickstart` tries again and goes on where the others stopped.")
         return 1
     ledgers = [run.ledger for run in runs]

@@ -1,4 +1,4 @@
-"""Train one run: `ray job submit --working-dir . -- python jobs/train.py configs/pointmass_space.yaml --out /shared/run`.
+"""Train one run: `ray job submit --working-dir . -- python jobs/train.py CONFIG --out /shared/run`.
 
 Takes the arguments of `space-dist train`. Inside a Ray job (RAY_ADDRESS is set there) the run joins that cluster.
 """

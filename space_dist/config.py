@@ -210,6 +210,14 @@ class TrackingConfig(_Section):
     """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; null: none."""
     experiment: str = Field(default="space_dist", min_length=1, max_length=200)
     """MLflow experiment."""
+    @field_validator("uri")
+    @classmethod
+    def _known_kind(cls, value: str | None) -> str | None:
+        kinds = ("sqlite:///", "http://", "https://")
+        if value is not None and not any(value.startswith(kind) and value != kind for kind in kinds):
+            raise ValueError("a tracking URI is sqlite:///FILE or http(s)://HOST:PORT")
+        return value
+
     live: bool = True
     """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
 

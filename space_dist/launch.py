@@ -182,15 +182,22 @@ def policy_of(ledger: Ledger) -> MlpWeights:
     raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
 
 
+def private_ray() -> None:
+    """Prepare this process for a Ray of its own; to be called before Ray is imported, which reads these once.
+
+    Ray runs whatever its ports are sent, so only who holds this process's own token may talk to them. (Unset, Ray makes
+    up a token and leaves it in the user's home.)
+    """
+    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
+
+
 @contextlib.contextmanager
 def _cluster(config: RunConfig, setup: Setup, stop: StopRequests) -> Iterator[Cluster]:
     if config.resources.workers == 0:
         yield InProcess(config, setup)
         return
     if config.resources.address == "local":
-        # Ray runs whatever its ports are sent, so only who holds this process's own token may talk to them. Ray reads
-        # these once, when it is imported; unset, it makes up a token and leaves it in the user's home.
-        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        private_ray()
     from space_dist.distributed import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with RayCluster(config, setup) as cluster:

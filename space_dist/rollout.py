@@ -27,7 +27,8 @@ IntArray = NDArray[np.int64]
 Layers = tuple[tuple[Array, Array], ...]
 Split = Literal["train", "test"]
 
-CHUNK = 4096  # start observations scored in one matrix product; part of every result
+CHUNK = 65_536  # start observations scored by one call
+BLOCK = 2_048  # rows of one matrix product: what fits the cache. Both are part of every result
 TERMINATED, TRUNCATED, CUT = 0, 1, 2
 
 
@@ -266,7 +267,8 @@ class Worker:
         if chunk not in self._starts:
             self._starts[chunk] = start_observations(self._setup, chunk)
         observations = self._starts[chunk]
-        scores = values(weights, observations).astype(np.float64)
+        blocks = [values(weights, observations[row : row + BLOCK]) for row in range(0, len(observations), BLOCK)]
+        scores = np.concatenate(blocks).astype(np.float64)
         means: FloatArray = scores.reshape(-1, self._setup.start_states).mean(axis=1)
         return means
 

@@ -551,4 +551,5 @@ def _unreachable(uri: str, error: Exception) -> TrackingError:
 
 def _first_line(error: Exception) -> str:
     text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0][:300].rstrip(".")
+    line = text.splitlines()[0]
+    return f"{line[:200]}…" if len(line) > 200 else line.rstrip(".")

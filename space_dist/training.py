@@ -16,6 +16,7 @@ picked up at the next wait, or before a commit: `_settle`. A run is a pure funct
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -46,6 +47,8 @@ from space_dist.rollout import (
     start_observations,
     to_arrays,
 )
+
+log = logging.getLogger("space_dist")
 
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
@@ -342,6 +345,7 @@ class Training:
                 row[split] = _summary(joined(parts), self._config.evaluation.episodes)
             self._append(row)
             self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
+            log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
 
         run.pending.append(_Pending([*train, *test], settle))
         run.evaluated_at = self._steps()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from space_dist.config import to_yaml
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Ledger, RunWriter, Status, find_ledgers
@@ -52,7 +53,7 @@ def start_run(
         writer.write_config(to_yaml(config), f"id,gate\n{train}", f"id,gate\n{test}")
         writer.set_status(
             Status("running", name, seed, 0, 4 * STEPS, 0, STARTED + seed, STARTED + seed,
-                   fingerprint={"cpu": "test", "torch": "2.0"})  # fmt: skip
+                   fingerprint={"cpu": "test", "torch": "2.0"})
         )
     return Ledger(folder)
 

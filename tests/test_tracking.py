@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import logging
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import mlflow
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
+
 from space_dist.errors import ConfigError
 from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
 from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, follow, sync
-from test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
+from tests.test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
 
 TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
 
@@ -157,19 +159,44 @@ def test_more_rows_than_one_call_takes(uri: str, tmp_path: Path) -> None:
     assert len(points["learner/loss"]) == many
 
 
-def test_params_that_a_death_left_out_are_completed(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ledger = start_run(tmp_path / "run", uri=uri)
+def test_a_death_after_any_call_is_made_good(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Die right after the 1st, 2nd, ... call that writes, until one push survives; then everything must be there."""
+    ledger = start_run(tmp_path / "run")
+    continue_run(ledger, [float(n) for n in range(61)], [[0]] * 60)  # two calls' worth of metrics
+    sync([ledger], uri, "reference")
+    reference = only_run(uri, "reference")
+    points, calls, deaths = histories(uri, reference), 0, 0
 
-    def die(*_: Any, **__: Any) -> None:
-        raise ConnectionError("cut")
+    def mortal(name: str) -> Callable[..., Any]:
+        write = getattr(MlflowClient, name)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(MlflowClient, "log_batch", die)
-        with pytest.raises(TrackingError, match="cut"):
-            sync([ledger])
-    assert only_run(uri).data.params == {}
-    sync([ledger])
-    assert only_run(uri).data.params["learner.kind"] == "ppo"
+        def call(*args: Any, **keywords: Any) -> Any:
+            nonlocal calls
+            answer = write(*args, **keywords)
+            calls += 1
+            if calls == deaths + 1:
+                raise ConnectionError("cut")
+            return answer
+
+        return call
+
+    while True:
+        calls, experiment = 0, f"died {deaths}"
+        with monkeypatch.context() as patch:
+            for name in ("create_experiment", "create_run", "log_batch", "log_artifact", "set_tag", "set_terminated"):
+                patch.setattr(MlflowClient, name, mortal(name))
+            try:
+                sync([ledger], uri, experiment)
+                break
+            except TrackingError:
+                deaths += 1
+        sync([ledger], uri, experiment)
+        run = only_run(uri, experiment)
+        assert histories(uri, run) == points
+        assert (run.data.params, run.info.status) == (reference.data.params, "FINISHED")
+        assert run.data.tags == reference.data.tags
+        assert len(MlflowClient(uri).list_artifacts(run.info.run_id)) == 8
+    assert deaths > 15
 
 
 @pytest.mark.parametrize(("state", "status"), [("failed", "FAILED"), ("interrupted", "KILLED")])
@@ -219,7 +246,7 @@ def test_a_dead_server_costs_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "store", ["file:///tmp/mlruns", "mlruns", "/tmp/mlruns", "", "sqlite://", "sqlite:///:memory:", "sqlite:mlflow.db",
+    "store", ["file:///srv/mlruns", "mlruns", "/srv/mlruns", "", "sqlite://", "sqlite:///:memory:", "sqlite:mlflow.db",
               "postgresql://user:word@host/db", "http://user:word@host:5000", "http://[", "databricks"]
 )  # fmt: skip
 def test_other_stores_are_refused(tmp_path: Path, store: str) -> None:

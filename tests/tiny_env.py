@@ -15,7 +15,7 @@ from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
 from space_dist.instances import ContextBounds
 
 HORIZON = 8
-STRIDE = 0.5  # how far a full action moves
+STRIDE = 0.25  # how far a full action moves
 START = 0.1  # starts are uniform in [-START, START]
 SUCCESS_DISTANCE = 0.1
 

@@ -43,6 +43,6 @@ class RoundRobin:
         return Selection(
             version=state.version,
             ids=self._instances.ids[state.selected],
-            contexts=self._instances.contexts[state.selected],
+            contexts=np.take(self._instances.contexts, state.selected, axis=0),
             order_version=state.order_version,
         )

@@ -9,10 +9,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
 from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, State
 from space_dist.instances import InstanceSet
-from space_dist.seeding import Purpose, combine, instance_keys
+from space_dist.seeding import Purpose, UInt64Array, combine, instance_keys
 
 
 class Space:
@@ -28,22 +29,20 @@ class Space:
     def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
         self._instances, self._eta, self._kappa = instances, eta, kappa
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
-        self._by_tie = np.argsort(self._ties, kind="stable")
 
     def start(self) -> tuple[State, Selection]:
         """Lines 1-3: one instance, chosen by the seed. Line 1's S := 0 would empty the set: S starts at 1."""
-        state = State(version=0, order_version=0, size=1, selected=self._by_tie[:1])
+        state = State(version=0, order_version=0, size=1, selected=np.argmin(self._ties)[None])
         return state, self.selection(state)
 
     def step(self, state: State, feedback: Feedback) -> tuple[State, Selection, Numbers]:
         """Lines 6-13: compare values on the set just trained on, maybe grow, and select by PIC."""
-        n, trained = len(self._instances), state.selected
-        before, after = feedback.values_before, feedback.values_after
+        n, trained = len(self._instances), self._membership(state.selected)
+        before, after = feedback.values_before[trained], feedback.values_after[trained]
 
         # Line 6: V_t := mean |V_t(s0, c_i)|. V_{t-1} is taken over the same instances, or the comparison in line 7
         # would mix a change of values with a change of set.
-        mean_before = float(np.abs(before[trained]).mean())
-        mean_after = float(np.abs(after[trained]).mean())
+        mean_before, mean_after = float(np.abs(before).mean()), float(np.abs(after).mean())
 
         # Lines 7-8: if V_t is within eta of V_{t-1}, grow. Without a gradient step nothing was learnt that could
         # have settled.
@@ -55,22 +54,23 @@ class Space:
         scores = self.scores(feedback)
 
         # Line 12: I_curr := the S instances with the highest d_t(i), best first.
-        selected = _highest(scores, size, self._by_tie)
+        selected = _highest(scores, size, self._ties)
+        chosen = self._membership(selected)
 
         new = dataclasses.replace(
             state,
             version=state.version + 1,
-            order_version=state.order_version if np.array_equal(selected, trained) else state.version + 1,
+            order_version=state.order_version if np.array_equal(selected, state.selected) else state.version + 1,
             size=size,
             selected=selected,
             tests=state.tests + tested,
             growths=state.growths + grew,
             stalled=0 if grew or size == n else state.stalled + tested,
-            mean_value=float(np.abs(after[selected]).mean()),
+            mean_value=float(np.abs(feedback.values_after[chosen]).mean()),
         )
         numbers: Numbers = {
             "size": size,
-            "trained_size": len(trained),
+            "trained_size": state.size,
             "grew": grew,
             "tests": new.tests,
             "growths": new.growths,
@@ -80,10 +80,10 @@ class Space:
             "relative_change": _relative_change(mean_before, mean_after),
             # Two other readings of lines 6-7 (docs/algorithm.md), logged so that they can be compared.
             "relative_change_as_printed": _relative_change(state.mean_value, mean_after),
-            "relative_change_each": float(np.abs(after[trained] - before[trained]).mean()) / max(mean_before, 1e-8),
-            "largest_pic": float((after - before).max()),
-            "smallest_pic": float((after - before).min()),
-            "kept": int(np.isin(selected, trained).sum()),
+            "relative_change_each": float(np.abs(after - before).mean()) / max(mean_before, 1e-8),
+            "largest_score": float(scores.max()),
+            "smallest_score": float(scores.min()),
+            "kept": int((trained & chosen).sum()),
         }
         return new, self.selection(new), numbers
 
@@ -91,12 +91,18 @@ class Space:
         """`(n,)` the performance improvement capacity d_t(i) of every instance (Definition 1), signed."""
         return feedback.values_after - feedback.values_before
 
+    def _membership(self, indices: IntArray) -> NDArray[np.bool_]:
+        """`(n,)` whether an instance is among `indices`; means over it do not depend on their order."""
+        members = np.zeros(len(self._instances), dtype=np.bool_)
+        members[indices] = True
+        return members
+
     def selection(self, state: State) -> Selection:
         """The instances a state has selected."""
         return Selection(
             version=state.version,
             ids=self._instances.ids[state.selected],
-            contexts=self._instances.contexts[state.selected],
+            contexts=np.take(self._instances.contexts, state.selected, axis=0),
             order_version=state.order_version,
         )
 
@@ -115,13 +121,20 @@ class RandomGrowth(Space):
         return combine(self._random, feedback.version).astype(np.float64)
 
 
-def _highest(scores: FloatArray, size: int, by_tie: IntArray) -> IntArray:
-    """`(size,)` indices of the highest scores, best first; equal scores stand in the order of `by_tie`."""
-    candidates = by_tie
+def _highest(scores: FloatArray, size: int, ties: UInt64Array) -> IntArray:
+    """`(size,)` indices of the highest scores, best first; equal scores stand in the order of their tie keys."""
     if size < len(scores):  # sorting a million scores for the best hundred would cost more than the values themselves
-        threshold = np.partition(scores, len(scores) - size)[len(scores) - size]
-        candidates = by_tie[scores[by_tie] >= threshold]
-    return candidates[np.argsort(-scores[candidates], kind="stable")[:size]]
+        candidates = np.flatnonzero(scores >= np.partition(scores, len(scores) - size)[len(scores) - size])
+        order = candidates[np.argsort(-scores[candidates])]
+    else:
+        order = np.argsort(-scores)
+    ranked = scores[order]
+    tied = np.zeros(len(order) + 1, dtype=np.bool_)
+    tied[1:-1] = ranked[1:] == ranked[:-1]
+    if tied.any():  # the order within a tie is still the sort's own whim
+        members = tied[1:] | tied[:-1]
+        order[members] = order[members][np.lexsort((ties[order[members]], -ranked[members]))]
+    return order[:size]
 
 
 def _relative_change(before: float | None, after: float) -> float | None:

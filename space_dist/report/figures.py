@@ -25,8 +25,9 @@ LINE_STYLES: Final = ("-", "--", ":", "-.")
 MAX_ROWS: Final = 500
 MAX_COLUMNS: Final = 1000
 MAX_LABELLED_INSTANCES: Final = 30
+MAX_MARKED: Final = 40  # a line of fewer evaluations shows each: one alone would be invisible
 _STEPS_LABEL: Final = "environment steps"
-_RETURN_LABEL: Final = "return per episode"
+_RETURN_LABEL: Final = "mean undiscounted return per episode"
 _DPI: Final = 150
 
 
@@ -37,8 +38,8 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
     medians over seeds as far as all drawn seeds got, with a thin line for each seed.
     """
     figure = _figure(15.0, 4.6 + 0.25 * ((len(configurations) - 1) // 3))
-    panels = figure.subplots(1, 3)
-    test, train, sizes = panels
+    test, train, sizes = figure.subplots(1, 3)
+    train.sharey(test)
     for number, configuration in enumerate(configurations):
         style = {
             "color": COLOURS[number % len(COLOURS)],
@@ -49,13 +50,12 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
         _draw_returns(train, *configuration.returns("train"), label, style)
         _draw_set_sizes(sizes, configuration, label, style)
     for axes, title, label in (
-        (test, "Test instances", f"mean {_RETURN_LABEL}"),
-        (train, "Training instances", f"mean {_RETURN_LABEL}"),
-        (sizes, "Curriculum", "instances trained on"),
+        (test, "Test instances", f"{_RETURN_LABEL}\n(IQM over seeds, 95 % interval)"),
+        (train, "Training instances", _RETURN_LABEL),
+        (sizes, "Curriculum", "instances trained on\n(median over seeds; thin: each seed)"),
     ):
         _dress(axes, title, label)
-    sizes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    sizes.set_ylim(bottom=0)
+    _count_upwards(sizes)
     columns = min(3, len(configurations))
     figure.legend(handles=test.get_lines(), loc="outside lower center", ncols=columns, frameon=False)
     return figure
@@ -71,15 +71,15 @@ def draw_learning_curve(run: Run) -> Figure:
     figure = _figure(7.5, 6.5)
     returns, sizes = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     for label, measures, colour, marker in (("test", run.test, COLOURS[0], "o"), ("train", run.train, COLOURS[1], "s")):
-        returns.plot(run.evaluation_steps, measures["return"], color=colour, marker=marker, markersize=3.5, label=label)
+        marked = marker if len(run.evaluation_steps) <= MAX_MARKED else None
+        returns.plot(run.evaluation_steps, measures["return"], color=colour, marker=marked, markersize=3.5, label=label)
     starts, trained = _set_size_steps(run)
     sizes.plot(starts, trained, color=COLOURS[2], drawstyle="steps-post")
-    _dress(returns, f"{run.status.name}, seed {run.status.seed}", f"mean {_RETURN_LABEL}")
+    _dress(returns, f"{run.status.name}, seed {run.status.seed}", _RETURN_LABEL)
     _dress(sizes, "", f"instances trained on\n(of {len(run.instance_ids):,})")
     returns.set_xlabel("")
     returns.legend(title="instances", frameon=False)
-    sizes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    sizes.set_ylim(bottom=0)
+    _count_upwards(sizes)
     return figure
 
 
@@ -170,19 +170,24 @@ def _dress(axes: Axes, title: str, label: str) -> None:
     axes.set_xlabel(_STEPS_LABEL)
     axes.set_ylabel(label)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
-    axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10], integer=True))
+    axes.set_xlim(0, max(1.0, axes.get_xlim()[1]))
     axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     if not any(np.size(line.get_xdata()) for line in axes.get_lines()):
+        axes.tick_params(labelleft=False, labelbottom=False)
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", va="center", color="#777777")
 
 
+def _count_upwards(axes: Axes) -> None:
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+    axes.set_ylim(bottom=0)
+
+
 def _draw_returns(axes: Axes, steps: IntArray, returns: FloatArray, label: str, style: dict[str, Any]) -> None:
-    """One line with its band. A single evaluation would make an invisible line, so points are marked while few."""
     centre = interquartile_mean(returns) if len(returns) else np.zeros(0)
-    marker = "o" if len(steps) <= 40 else None
+    marker = "o" if len(steps) <= MAX_MARKED else None
     axes.plot(steps, centre, label=label, marker=marker, markersize=3, linewidth=1.8, **style)
     if len(returns) > 1:
         low, high = bootstrap_interval(returns)

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import space_dist
+from space_dist import errors
+
+ROOT = Path(__file__).parent.parent
+HEAVY = ("ray", "torch", "mlflow", "stable_baselines3", "sb3_contrib")
+
+
+def imported_with(module: str) -> set[str]:
+    """The top-level packages that a fresh interpreter holds once it has imported `module`."""
+    program = f"import json, sys, {module}; print(json.dumps(sorted({{name.split('.')[0] for name in sys.modules}})))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout))
+
+
+@pytest.mark.parametrize("module", ["space_dist.curricula", "space_dist.rollout"])
+def test_importing_it_imports_nothing_heavy(module: str):
+    imported = imported_with(module)
+    assert {"space_dist", "numpy"} <= imported
+    assert not imported.intersection(HEAVY)
+
+
+def test_the_curricula_need_no_environment_either():
+    assert "gymnasium" not in imported_with("space_dist.curricula")
+
+
+def test_the_import_contracts_hold():
+    program = Path(sys.executable).parent / "lint-imports"
+    done = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_error_tree_is_exported_whole():
+    raised = {one for one in vars(errors).values() if isinstance(one, type) and issubclass(one, Exception)}
+    assert {one.__name__ for one in raised} | {"__version__"} == set(space_dist.__all__)
+    for error in raised:
+        assert getattr(space_dist, error.__name__) is error
+        assert issubclass(error, space_dist.SpaceDistError)
+        assert error.__doc__
+
+
+def test_each_error_ends_a_command_with_its_documented_code():
+    # 2: retrying cannot help. 75: EX_TEMPFAIL, "requeue me". 1: anything else. 0 would be success.
+    codes = {name: getattr(space_dist, name).exit_code for name in space_dist.__all__ if name != "__version__"}
+    assert codes == {"SpaceDistError": 1, "ConfigError": 2, "LedgerError": 1, "RunLockedError": 1, "Interrupted": 75}

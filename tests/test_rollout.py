@@ -1,0 +1,532 @@
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from space_dist.config import PPOConfig
+from space_dist.curricula import Selection
+from space_dist.envs import ContextObservation, make_batched
+from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
+from space_dist.instances import ContextBounds, InstanceSet
+from space_dist.learner import Learner
+from space_dist.rollout import (
+    CHUNK,
+    CUT,
+    TERMINATED,
+    TRUNCATED,
+    MlpWeights,
+    Outcomes,
+    Setup,
+    Shard,
+    Walk,
+    Worker,
+    act,
+    collect,
+    executed,
+    forward,
+    from_arrays,
+    joined,
+    to_arrays,
+    values,
+)
+from space_dist.seeding import Purpose, episode_seeds, generator
+from tests import tiny_env
+
+POINTMASS = "space_dist/PointMass-v0"
+LOW, HIGH = np.array([-4.0, 0.5, 0.0]), np.array([4.0, 8.0, 4.0])
+
+
+class Countdown:
+    """Ends by itself after `length` steps, or is truncated after 5. Observes (length, steps so far), earns the step."""
+
+    def __init__(self, n_slots: int) -> None:
+        self.n_slots, self.horizon = n_slots, 5
+        self.observation_space = spaces.Box(0.0, 100.0, shape=(2,), dtype=np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32)
+        self.context_bounds = ContextBounds(("length",), np.array([1.0]), np.array([100.0]))
+        self.length, self.time = np.zeros(n_slots), np.zeros(n_slots)
+        self.ready = np.zeros(n_slots, dtype=np.bool_)
+
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
+        assert len(slots) == len(contexts) == len(seeds)
+        self.length[slots], self.time[slots], self.ready[slots] = contexts[:, 0], 0.0, True
+        return self.observe()[slots]
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        assert self.ready.all(), "an ended slot was not reset"
+        assert (np.abs(actions.astype(np.float64)) <= 1.0).all()
+        self.time += 1
+        terminated, truncated = self.time >= self.length, self.time >= self.horizon
+        self.ready = ~(terminated | truncated)
+        return Step(self.observe(), self.time.copy(), terminated, truncated, None)
+
+    def observe(self) -> Observations:
+        return np.stack([self.length, self.time], axis=1).astype(np.float32)
+
+
+def weights_for(
+    observation_dim: int, outputs: int, *, discrete: bool = False, version: int = 0, seed: int = 0, bias: float = 0.0
+) -> MlpWeights:
+    """A random network whose actions depend on what it sees; `bias` is added to its last output."""
+    random = np.random.default_rng(seed)
+
+    def layers(*sizes: int) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]:
+        return tuple(
+            (random.normal(0.0, 1.0, size=(n, m)).astype(np.float32), random.normal(size=m).astype(np.float32))
+            for n, m in zip(sizes[:-1], sizes[1:], strict=True)
+        )
+
+    actor, critic = layers(observation_dim, 8, outputs), layers(observation_dim, 8, 1)
+    actor[-1][1][-1] += np.float32(bias)
+    log_std = None if discrete else np.full(outputs, 0.3, dtype=np.float32)
+    return MlpWeights(version, "tanh", actor, critic, log_std)
+
+
+def falling(version: int = 0, seed: int = 0) -> MlpWeights:
+    """PointMass weights (context visible) that mostly fall onto the wall, but not always."""
+    return weights_for(7, 2, version=version, seed=seed, bias=-2.0)
+
+
+def select(contexts: FloatArray, *, version: int = 0, ids: IntArray | None = None) -> Selection:
+    return Selection(version, 100 + np.arange(len(contexts)) if ids is None else ids, contexts, 0)
+
+
+def uniform(n: int, seed: int = 0) -> FloatArray:
+    return np.random.default_rng(seed).uniform(LOW, HIGH, size=(n, 3))
+
+
+def setup_for(env_id: str = POINTMASS, **changes: Any) -> Setup:
+    names = ("gate_x", "gate_width", "friction")
+    setup = Setup(
+        env_id=env_id, context_visible=True, seed=3, gamma=0.9, shards=3, slots=4, slot_length=120, start_states=1,
+        evaluation_episodes=1, train=InstanceSet(np.arange(10), uniform(10), names),
+        test=InstanceSet(np.arange(5), uniform(5, seed=1), names),
+    )  # fmt: skip
+    return dataclasses.replace(setup, **changes)
+
+
+def bits(answer: Shard | Outcomes) -> dict[str, Any]:
+    """Everything in it, comparable with `==`, NaN included."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return value.dtype.str, value.shape, value.tobytes()
+        return {name: plain(item) for name, item in value.items()} if isinstance(value, dict) else value
+
+    return plain(dataclasses.asdict(answer))
+
+
+def falls(worker: Worker, *, round: int = 0, shard: int = 0, start: Walk | None = None) -> Shard:
+    selection = select(uniform(6), version=4)
+    walk = start or Walk(-1, ())
+    return worker.collect(falling(version=round), selection, walk, round=round, shard=shard, selection_version=4)
+
+
+# ---- policies in NumPy ----
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("action_space", [spaces.Box(-0.7, 0.4, shape=(3,), dtype=np.float32), spaces.Discrete(5)])
+@pytest.mark.parametrize("net_arch", [(), (16,), (32, 7, 12)])
+def test_networks_equal_stable_baselines3s(
+    activation: Any, action_space: spaces.Space[Any], net_arch: tuple[int, ...]
+) -> None:
+    space = spaces.Box(-np.inf, np.inf, shape=(6,), dtype=np.float32)
+    config = PPOConfig(kind="ppo", activation=activation, net_arch=net_arch, log_std_init=-0.5)
+    learner = Learner(config, space, action_space, seed=0, n_slots=2, slot_length=4, total_steps=8)
+    policy = learner.model.policy
+    with torch.no_grad():  # far from their initial scale, biases included
+        generator = torch.Generator().manual_seed(1)
+        for parameter in policy.parameters():
+            parameter += 0.5 * torch.randn(parameter.shape, generator=generator)
+    weights = learner.weights(7)
+    assert weights.version == 7
+    random = np.random.default_rng(2)
+    observations = random.normal(0.0, 2.0, size=(500, 6)).astype(np.float32)
+    tensor = torch.as_tensor(observations)
+    with torch.no_grad():
+        distribution = policy.get_distribution(tensor).distribution
+        expected_values = policy.predict_values(tensor).numpy()[:, 0]
+    np.testing.assert_allclose(values(weights, observations), expected_values, rtol=1e-5, atol=1e-5)
+    outputs = forward(weights.actor, weights.activation, observations)
+    best = executed(action_space, act(weights, observations, None))
+    expected_best, _ = policy.predict(observations, deterministic=True)
+    if isinstance(action_space, spaces.Box):
+        np.testing.assert_allclose(outputs, distribution.mean, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(best, expected_best, rtol=1e-5, atol=1e-5)
+        noise = random.normal(size=(500, 3)).astype(np.float32)
+        sampled = distribution.mean + distribution.stddev * torch.as_tensor(noise)
+        np.testing.assert_allclose(act(weights, observations, noise), sampled, rtol=1e-5, atol=1e-5)
+    else:
+        shifted = outputs - np.logaddexp.reduce(outputs, axis=1, keepdims=True)
+        np.testing.assert_allclose(shifted, distribution.logits, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(best, expected_best)
+
+
+def test_weights_are_a_copy_and_inputs_stay_untouched() -> None:
+    space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
+    learner = Learner(PPOConfig(kind="ppo"), space, space, seed=0, n_slots=1, slot_length=4, total_steps=8)
+    weights, observations = learner.weights(0), np.ones((3, 2), dtype=np.float32)
+    before = act(weights, observations, None)
+    with torch.no_grad():
+        for parameter in learner.model.policy.parameters():
+            parameter += 1.0
+    np.testing.assert_array_equal(act(weights, observations, None), before)
+    np.testing.assert_array_equal(observations, 1.0)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_a_policy_survives_being_arrays(discrete: bool) -> None:
+    weights = weights_for(4, 3, discrete=discrete, version=9)
+    again = from_arrays(*to_arrays(weights))
+    observations = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
+    assert (again.version, again.activation) == (9, "tanh")
+    np.testing.assert_array_equal(act(again, observations, None), act(weights, observations, None))
+    np.testing.assert_array_equal(values(again, observations), values(weights, observations))
+    np.testing.assert_array_equal(again.log_std, weights.log_std)
+
+
+def test_actions_are_clipped_as_stable_baselines3_clips_them() -> None:
+    space = spaces.Box(np.float32([-1.0, -2.0]), np.float32([0.5, 4.0]))
+    actions = np.float32([[-3.0, -3.0], [0.6, 4.5], [0.1, 0.2], [np.inf, -np.inf]])
+    given = actions.copy()
+    np.testing.assert_array_equal(
+        executed(space, actions), np.float32([[-1.0, -2.0], [0.5, 4.0], [0.1, 0.2], [0.5, -2.0]])
+    )
+    np.testing.assert_array_equal(actions, given)
+    np.testing.assert_array_equal(executed(spaces.Discrete(3), np.array([0, 2, 1])), [0, 2, 1])
+
+
+def test_discrete_actions_are_drawn_from_the_softmax() -> None:
+    env = make_batched("tests.tiny_env:make_discrete", 256, context_visible=True)
+    weights = weights_for(2, 3, discrete=True)
+    contexts = np.random.default_rng(0).uniform(-1.0, 1.0, size=(50, 1))
+    shard = collect(env, weights, select(contexts), start=0, length=160, gamma=0.9, seed=0, round=0, shard=0)
+    outputs = forward(weights.actor, weights.activation, shard.observations.reshape(-1, 2)).astype(np.float64)
+    chances = np.exp(outputs - outputs.max(axis=1, keepdims=True))
+    chances /= chances.sum(axis=1, keepdims=True)
+    drawn = np.eye(3)[shard.actions.reshape(-1)]
+    assert (np.ptp(chances, axis=0) > 0.5).all()
+    # Given the past, drawn - chances has mean 0 and lies in an interval of length 1; so does its product with a
+    # weight in [0, 1]. Azuma-Hoeffding: P(|mean| > b) <= 2 exp(-2 n b^2), here 1e-9 over all 12 tests together.
+    bound = np.sqrt(np.log(2 * 12 / 1e-9) / (2 * len(drawn)))
+    assert bound < 0.02
+    for weight in (np.ones(len(drawn)), *chances.T):
+        assert (np.abs((weight[:, None] * (drawn - chances)).mean(axis=0)) < bound).all()
+
+
+# ---- collecting ----
+
+
+def by_hand(lengths: list[float], *, start: int, length: int, slots: int = 2) -> Shard:
+    contexts = np.array(lengths)[:, None]
+    return collect(
+        Countdown(slots), weights_for(2, 1), select(contexts, ids=10 * np.arange(len(lengths))),
+        start=start, length=length, gamma=0.5, seed=1, round=0, shard=0,
+    )  # fmt: skip
+
+
+def test_the_walk_by_hand() -> None:
+    # Instances 0, 10, 20 live 2, 3 and 9 steps (the last is truncated after 5); the walk starts at instance 10.
+    #   time    0  1  2  3  4  5  6  7
+    #   slot 0  10 10 10 10 10 10 20 20     first 10 (0-2), then 10 again (3-5), then 20 (6-, cut)
+    #   slot 1  20 20 20 20 20 0  0  10     20 (0-4, truncated), 0 (5-6), 10 (7-, cut)
+    # The order of starts is 10, 20 | t = 3: 0 ...
+    # so slot 0 takes 0 at t = 3 (3-4), both slots end at t = 4 and take 10 and 20 in slot order.
+    shard = by_hand([2.0, 3.0, 9.0], start=1, length=8)
+    episodes = shard.episodes
+    assert episodes.ids.tolist() == [10, 20, 0, 10, 20]
+    assert episodes.slots.tolist() == [0, 1, 0, 0, 1]
+    assert episodes.starts.tolist() == [0, 0, 3, 5, 5]
+    assert episodes.lengths.tolist() == [3, 5, 2, 3, 3]
+    assert episodes.ends.tolist() == [TERMINATED, TRUNCATED, TERMINATED, TERMINATED, CUT]
+    assert episodes.returns.tolist() == [6.0, 15.0, 3.0, 6.0, 6.0]
+    # 1 + 2/2 + 3/4 = 2.75; ... + 4/8 + 5/16 = 3.5625; 1 + 2/2 = 2
+    assert episodes.discounted_returns.tolist() == [2.75, 3.5625, 2.0, 2.75, 2.75]
+    assert np.isnan(episodes.success).all()
+    assert shard.observations[:, 0].tolist() == [[3, 0], [3, 1], [3, 2], [2, 0], [2, 1], [3, 0], [3, 1], [3, 2]]
+    assert shard.observations[:, 1].tolist() == [[9, 0], [9, 1], [9, 2], [9, 3], [9, 4], [9, 0], [9, 1], [9, 2]]
+    assert shard.last_observations.tolist() == [[3, 3], [9, 3]]
+    assert shard.truncated_observations.tolist() == [[9, 5]]
+
+
+def test_slots_that_end_together_take_the_next_instances_in_slot_order() -> None:
+    # Lives 1, 2, 2, 5: slots 0-2 start with 0, 10, 20; slot 0 takes 30 at t = 1; slots 1 and 2 take 0 and 10 at t = 2.
+    episodes = by_hand([1.0, 2.0, 2.0, 5.0], start=0, length=4, slots=3).episodes
+    #                              t = 0  |  1 |  2    |  3: slot 1 (0 lived one step) takes 20
+    assert episodes.ids.tolist() == [0, 10, 20, 30, 0, 10, 20]
+    assert episodes.slots.tolist() == [0, 1, 2, 0, 1, 2, 1]
+    assert episodes.starts.tolist() == [0, 0, 0, 1, 2, 2, 3]
+    assert episodes.ends.tolist() == [TERMINATED, TERMINATED, TERMINATED, CUT, TERMINATED, TERMINATED, CUT]
+
+
+def test_an_end_at_the_last_step_is_no_cut() -> None:
+    # Both live exactly to the round's last step: one by itself (a terminated step is never truncated too), one not.
+    shard = by_hand([5.0, 9.0], start=0, length=5)
+    assert shard.episodes.ends.tolist() == [TERMINATED, TRUNCATED]
+    assert not (shard.terminated & shard.truncated).any()
+    assert shard.truncated_observations.tolist() == [[9, 5]]
+
+
+def test_truncated_observations_stand_in_the_order_of_argwhere() -> None:
+    # Slot 0 is truncated at t = 4; slot 1 lives 2 steps first, so it is truncated at t = 6; slot 2 with slot 0.
+    shard = by_hand([50.0, 2.0, 60.0, 70.0], start=0, length=9, slots=3)
+    assert np.argwhere(shard.truncated).tolist() == [[4, 0], [4, 2], [6, 1]]
+    assert shard.truncated_observations.tolist() == [[50, 5], [60, 5], [70, 5]]
+
+
+def test_a_shards_table_tells_what_its_arrays_hold() -> None:
+    length, slots, gamma = 230, 16, 0.9
+    env = make_batched(POINTMASS, slots, context_visible=True)
+    contexts = uniform(7)
+    selection = dataclasses.replace(select(contexts, version=3), order_version=2)
+    shard = collect(env, falling(version=5), selection, start=4, length=length, gamma=gamma, seed=2, round=5, shard=1)
+    assert (shard.shard, shard.round, shard.weights_version, shard.selection_version, shard.order_version) == (
+        1, 5, 5, 3, 2
+    )  # fmt: skip
+    assert shard.observations.shape == (length, slots, 7)
+    assert shard.observations.dtype == np.float32
+    assert shard.actions.shape == (length, slots, 2)
+    assert shard.rewards.shape == shard.terminated.shape == shard.truncated.shape == (length, slots)
+    assert shard.last_observations.shape == (slots, 7)
+    assert not (shard.terminated & shard.truncated).any()
+
+    ended = shard.terminated | shard.truncated
+    found = []
+    for slot in range(slots):
+        begin = 0
+        for time in range(length):
+            if ended[time, slot] or time == length - 1:
+                end = TERMINATED if shard.terminated[time, slot] else TRUNCATED if shard.truncated[time, slot] else CUT
+                found.append((begin, slot, time + 1 - begin, end))
+                begin = time + 1
+    found.sort()  # episodes start in the order of time, and of slots within a step
+    episodes = shard.episodes
+    rows = zip(episodes.starts, episodes.slots, episodes.lengths, episodes.ends, strict=True)
+    assert [tuple(map(int, row)) for row in rows] == found
+    assert {end for *_, end in found} == {TERMINATED, TRUNCATED, CUT}
+    assert len(episodes) == len(found) == ended.sum() + (~ended[-1]).sum()
+    assert (episodes.ends == CUT).sum() == (~ended[-1]).sum()
+    assert episodes.lengths.sum() == length * slots
+    assert episodes.lengths.max() == 100
+
+    order = (4 + np.arange(len(found))) % 7
+    np.testing.assert_array_equal(episodes.ids, selection.ids[order])
+    scaled = 2.0 * (contexts - LOW) / (HIGH - LOW) - 1.0
+    for row, (begin, slot, steps, end) in enumerate(found):
+        mine = slice(begin, begin + steps), slot
+        rewards = shard.rewards[mine]
+        assert episodes.returns[row] == pytest.approx(rewards.sum(), rel=1e-12)
+        assert episodes.discounted_returns[row] == pytest.approx((gamma ** np.arange(steps) * rewards).sum(), rel=1e-12)
+        np.testing.assert_array_equal(shard.observations[begin, slot, :4], [0, 0, 3, 0])  # a fresh reset
+        np.testing.assert_allclose(shard.observations[mine][:, 4:], np.tile(scaled[order[row]], (steps, 1)), rtol=1e-6)
+        if begin + steps < length:
+            behind = None
+        else:
+            behind = shard.last_observations[slot]
+        if end == TRUNCATED:
+            at = np.argwhere(shard.truncated).tolist().index([begin + steps - 1, slot])
+            behind = shard.truncated_observations[at]
+        if behind is not None and end != TERMINATED:  # rewards are those of where the step led
+            distance = np.hypot(behind[0], behind[2] + 3.0)
+            assert rewards[-1] == pytest.approx(np.exp(-0.6 * distance), rel=1e-5)
+            assert episodes.success[row] == (distance < 0.25)
+
+
+def test_a_shard_replays_by_hand_from_its_seeds() -> None:
+    # Every episode, flown by the registered environment with the recorded actions, clipped, and the stated seed.
+    length, slots, seed, round, shard = 110, 3, 6, 2, 1
+    env = make_batched(POINTMASS, slots, context_visible=True)
+    weights, selection = falling(version=round), select(uniform(4))
+    told = collect(env, weights, selection, start=0, length=length, gamma=0.9, seed=seed, round=round, shard=shard)
+    seeds = episode_seeds(seed, Purpose.EPISODES, round, shard, count=slots * length)
+    single = ContextObservation(gym.make(POINTMASS))
+    for row in range(len(told.episodes)):
+        begin, slot = told.episodes.starts[row], told.episodes.slots[row]
+        context = selection.contexts[row % 4]
+        observation, _ = single.reset(seed=int(seeds[row]), options={"context": context})
+        for time in range(begin, begin + told.episodes.lengths[row]):
+            np.testing.assert_array_equal(told.observations[time, slot], observation)
+            observation, reward, *_ = single.step(np.clip(told.actions[time, slot], -10.0, 10.0))
+            assert told.rewards[time, slot] == reward
+    # Actions are the policy's, with the stated noise.
+    noise = generator(seed, Purpose.ACTIONS, round, shard).standard_normal((length, slots, 2), dtype=np.float32)
+    means = forward(weights.actor, "tanh", told.observations.reshape(-1, 7)).reshape(length, slots, 2)
+    np.testing.assert_allclose(told.actions, means + np.exp(weights.log_std) * noise, rtol=1e-5, atol=1e-5)
+
+
+def test_a_shard_is_a_pure_function_of_what_was_asked() -> None:
+    setup = setup_for()
+    worker = Worker(setup)
+    first = bits(falls(worker))
+    assert bits(falls(worker)) == first
+    falls(worker, round=1, shard=2)
+    worker.evaluate(falling(seed=4), "test", 0)
+    worker.start_values(falling(seed=4), 0)
+    np.random.seed(0)  # noqa: NPY002 - the global generator must play no part
+    assert bits(falls(worker)) == first
+    assert bits(falls(Worker(setup))) == first
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda: falls(Worker(setup_for()), round=1),
+        lambda: falls(Worker(setup_for()), shard=1, start=Walk(0, (0, 0, 0))),
+        lambda: falls(Worker(setup_for(seed=4))),
+    ],
+    ids=["round", "shard", "seed"],
+)
+def test_another_round_shard_or_seed_gives_other_noise(other: Callable[[], Shard]) -> None:
+    first, second = falls(Worker(setup_for())), other()
+    np.testing.assert_array_equal(second.episodes.ids[:4], first.episodes.ids[:4])
+    same_start = first.observations[0] == second.observations[0]
+    assert same_start.all()
+    assert not (first.actions[0] == second.actions[0]).any()
+    assert not (first.observations[1, :, 0] == second.observations[1, :, 0]).any()
+
+
+def test_where_shards_walk() -> None:
+    selection = select(uniform(6))
+    fresh = Walk(-1, ())
+    assert [fresh.position(selection, shard, 3) for shard in range(3)] == [0, 2, 4]
+    assert [fresh.position(selection, shard, 4) for shard in range(4)] == [0, 1, 3, 4]
+    assert [fresh.position(select(uniform(2)), shard, 4) for shard in range(4)] == [0, 0, 1, 1]
+    going_on = Walk(0, (5, 7, 1))
+    assert [going_on.position(selection, shard, 3) for shard in range(3)] == [5, 1, 1]
+    new_order = dataclasses.replace(selection, order_version=1)
+    assert [going_on.position(new_order, shard, 3) for shard in range(3)] == [0, 2, 4]
+    shard = falls(Worker(setup_for()), shard=2, start=Walk(0, (0, 0, 3)))
+    assert shard.episodes.ids[:4].tolist() == [103, 104, 105, 100]
+
+
+@pytest.mark.parametrize(("selection_version", "weights_version"), [(3, 0), (5, 0), (4, 1)])
+def test_a_version_that_was_not_asked_for_is_refused(selection_version: int, weights_version: int) -> None:
+    selection = select(uniform(6), version=4)
+    with pytest.raises(RuntimeError, match=f"selection {selection_version} "):
+        Worker(setup_for()).collect(
+            falling(version=weights_version), selection, Walk(-1, ()),
+            round=0, shard=0, selection_version=selection_version,
+        )  # fmt: skip
+
+
+# ---- evaluating ----
+
+
+def flown(weights: MlpWeights, context: FloatArray, seed: int, gamma: float) -> tuple[float, float, int, float]:
+    """Return, discounted return, length and success of one deterministic episode, stepped alone."""
+    env = ContextObservation(gym.make(POINTMASS))
+    observation, _ = env.reset(seed=seed, options={"context": context})
+    rewards, ended = [], False
+    while not ended:
+        action = forward(weights.actor, weights.activation, observation[None])[0]
+        observation, reward, terminated, truncated, info = env.step(np.clip(action, -10.0, 10.0))
+        rewards.append(reward)
+        ended = terminated or truncated
+    return sum(rewards), sum(gamma**t * reward for t, reward in enumerate(rewards)), len(rewards), info["success"]
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_evaluation_is_one_whole_episode_per_row(split: Any) -> None:
+    setup = setup_for(evaluation_episodes=2)
+    weights, instances = falling(version=8), setup.instances(split)
+    worker = Worker(setup)
+    parts = [worker.evaluate(weights, split, part) for part in range(setup.evaluation_parts)]
+    told = joined(parts)
+    assert told.weights_version == 8
+    assert len(told.returns) == 2 * len(instances)
+    seeds = episode_seeds(3, Purpose.EVALUATION, int(split == "test"), count=2 * len(instances))
+    expected = [
+        flown(weights, instances.contexts[row // 2], int(seed), setup.gamma) for row, seed in enumerate(seeds)
+    ]
+    returns, discounted, lengths, success = zip(*expected, strict=True)
+    np.testing.assert_array_equal(told.lengths, lengths)
+    np.testing.assert_allclose(told.returns, returns, rtol=1e-5)
+    np.testing.assert_allclose(told.discounted_returns, discounted, rtol=1e-5)
+    np.testing.assert_array_equal(told.success, success)
+    assert len(set(lengths)) > 2  # some crashed while others went on
+    assert 100 in lengths
+    again = joined([Worker(setup).evaluate(weights, split, part) for part in range(setup.evaluation_parts)])
+    assert bits(again) == bits(told)
+
+
+def test_finished_slots_are_not_counted() -> None:
+    # Two slots of one environment: what happens to the first after its end changes neither its numbers nor the other's.
+    setup = setup_for("tests.test_rollout:Countdown", context_visible=False, shards=1, gamma=0.5,
+                      train=InstanceSet(np.arange(3), np.array([[1.0], [3.0], [9.0]]), ("length",)))  # fmt: skip
+    told = Worker(setup).evaluate(weights_for(2, 1), "train", 0)
+    assert told.lengths.tolist() == [1, 3, 5]
+    assert told.returns.tolist() == [1.0, 6.0, 15.0]
+    assert told.discounted_returns.tolist() == [1.0, 2.75, 3.5625]
+    assert np.isnan(told.success).all()
+
+
+def test_more_parts_than_episodes() -> None:
+    setup = setup_for(shards=7)
+    parts = [Worker(setup).evaluate(falling(), "test", part) for part in range(7)]
+    assert [len(part.returns) for part in parts] == [1, 1, 1, 1, 1, 0, 0]
+    whole = Worker(setup_for(shards=1)).evaluate(falling(), "test", 0)
+    np.testing.assert_allclose(joined(parts).returns, whole.returns, rtol=1e-5)
+
+
+def test_measuring_never_touches_training() -> None:
+    setup = setup_for(slots=5)  # as many slots as one part of the test split has episodes
+    undisturbed, measured = Worker(setup), Worker(setup)
+    before = [bits(falls(undisturbed, round=round)) for round in range(3)]
+    after = []
+    for round in range(3):
+        measured.evaluate(falling(), "test", 0)
+        measured.start_values(falling(), 0)
+        after.append(bits(falls(measured, round=round)))
+        measured.evaluate(falling(), "train", 0)
+    assert after == before
+
+
+# ---- start values ----
+
+
+def lines(n: int, **changes: Any) -> Setup:
+    instances = InstanceSet(np.arange(n), np.linspace(-1.0, 1.0, n)[:, None], ("target",))
+    return setup_for("tests.tiny_env:make", train=instances, test=instances, **changes)
+
+
+def test_start_values_are_means_over_seeded_starts() -> None:
+    setup = lines(10, start_states=1000)
+    assert (setup.chunk_size, setup.chunks) == (4, 3)
+    weights, worker = weights_for(2, 1), Worker(setup)
+    told = [worker.start_values(weights, chunk) for chunk in range(setup.chunks)]
+    assert [len(chunk) for chunk in told] == [4, 4, 2]
+    expected = []
+    for instance, target in enumerate(setup.train.contexts):
+        chunk, place = divmod(instance, 4)
+        seeds = episode_seeds(3, Purpose.START_STATES, chunk, count=len(told[chunk]) * 1000)
+        env = tiny_env.make(1000)
+        mine = seeds[1000 * place : 1000 * (place + 1)]
+        starts = env.reset(np.arange(1000), np.tile(target, (1000, 1)), mine)
+        observed = np.concatenate([starts, np.full((1000, 1), target, dtype=np.float32)], axis=1)
+        assert np.ptp(observed[:, 0]) > tiny_env.START
+        expected.append(values(weights, observed).astype(np.float64).mean())
+    np.testing.assert_allclose(np.concatenate(told), expected, rtol=1e-5)
+    assert [Worker(setup).start_values(weights, 1).tobytes(), told[0].tobytes()] == [
+        told[1].tobytes(), worker.start_values(weights, 0).tobytes()
+    ]  # fmt: skip
+
+
+def test_joined_chunks_equal_one_big_evaluation() -> None:
+    n = 2 * CHUNK + 100
+    contexts = uniform(n)
+    setup = setup_for(train=InstanceSet(np.arange(n), contexts, ("gate_x", "gate_width", "friction")))
+    assert setup.chunks == 3
+    weights, worker = falling(), Worker(setup)
+    told = np.concatenate([worker.start_values(weights, chunk) for chunk in range(3)])
+    scaled = 2.0 * (contexts - LOW) / (HIGH - LOW) - 1.0
+    observed = np.concatenate([np.tile([0.0, 0.0, 3.0, 0.0], (n, 1)), scaled], axis=1).astype(np.float32)
+    np.testing.assert_allclose(told, values(weights, observed), rtol=1e-5, atol=1e-6)
