@@ -183,12 +183,13 @@ def policy_of(ledger: Ledger) -> MlpWeights:
 
 
 def private_ray() -> None:
-    """Prepare this process for a Ray of its own; to be called before Ray is imported, which reads these once.
+    """Prepare this process for Rays of its own; to be called before Ray is imported, which reads these once.
 
     Ray runs whatever its ports are sent, so only who holds this process's own token may talk to them. (Unset, Ray makes
     up a token and leaves it in the user's home.)
     """
-    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
+    if "ray" not in sys.modules:
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
 
 
 @contextlib.contextmanager

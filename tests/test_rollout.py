@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -81,7 +82,7 @@ def weights_for(
     def layers(*sizes: int) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]:
         return tuple(
             (random.normal(0.0, 1.0, size=(n, m)).astype(np.float32), random.normal(size=m).astype(np.float32))
-            for n, m in zip(sizes[:-1], sizes[1:], strict=True)
+            for n, m in itertools.pairwise(sizes)
         )
 
     actor, critic = layers(observation_dim, 8, outputs), layers(observation_dim, 8, 1)
@@ -146,7 +147,7 @@ def test_networks_equal_stable_baselines3s(
     with torch.no_grad():  # far from their initial scale, biases included
         generator = torch.Generator().manual_seed(1)
         for parameter in policy.parameters():
-            parameter += 0.5 * torch.randn(parameter.shape, generator=generator)
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.5)
     weights = learner.weights(7)
     assert weights.version == 7
     random = np.random.default_rng(2)
@@ -171,15 +172,17 @@ def test_networks_equal_stable_baselines3s(
         np.testing.assert_array_equal(best, expected_best)
 
 
-def test_weights_are_a_copy_and_inputs_stay_untouched() -> None:
-    space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
-    learner = Learner(PPOConfig(kind="ppo"), space, space, seed=0, n_slots=1, slot_length=4, total_steps=8)
-    weights, observations = learner.weights(0), np.ones((3, 2), dtype=np.float32)
-    before = act(weights, observations, None)
+@pytest.mark.parametrize(("inputs", "outputs"), [(2, 2), (1, 1)])
+def test_weights_are_a_copy_and_inputs_stay_untouched(inputs: int, outputs: int) -> None:
+    space, actions = (spaces.Box(-1.0, 1.0, shape=(n,), dtype=np.float32) for n in (inputs, outputs))
+    learner = Learner(PPOConfig(kind="ppo"), space, actions, seed=0, n_slots=1, slot_length=4, total_steps=8)
+    weights, observations = learner.weights(0), np.ones((3, inputs), dtype=np.float32)
+    before = act(weights, observations, None), values(weights, observations)
     with torch.no_grad():
         for parameter in learner.model.policy.parameters():
-            parameter += 1.0
-    np.testing.assert_array_equal(act(weights, observations, None), before)
+            parameter.add_(1.0)
+    np.testing.assert_array_equal(act(weights, observations, None), before[0])
+    np.testing.assert_array_equal(values(weights, observations), before[1])
     np.testing.assert_array_equal(observations, 1.0)
 
 
@@ -214,7 +217,8 @@ def test_discrete_actions_are_drawn_from_the_softmax() -> None:
     chances = np.exp(outputs - outputs.max(axis=1, keepdims=True))
     chances /= chances.sum(axis=1, keepdims=True)
     drawn = np.eye(3)[shard.actions.reshape(-1)]
-    assert (np.ptp(chances, axis=0) > 0.5).all()
+    assert (np.ptp(chances, axis=0) > 0.05).all()  # chances that depend on what is seen
+    assert np.ptp(chances) > 0.8
     # Given the past, drawn - chances has mean 0 and lies in an interval of length 1; so does its product with a
     # weight in [0, 1]. Azuma-Hoeffding: P(|mean| > b) <= 2 exp(-2 n b^2), here 1e-9 over all 12 tests together.
     bound = np.sqrt(np.log(2 * 12 / 1e-9) / (2 * len(drawn)))
@@ -328,10 +332,7 @@ def test_a_shards_table_tells_what_its_arrays_hold() -> None:
         assert episodes.discounted_returns[row] == pytest.approx((gamma ** np.arange(steps) * rewards).sum(), rel=1e-12)
         np.testing.assert_array_equal(shard.observations[begin, slot, :4], [0, 0, 3, 0])  # a fresh reset
         np.testing.assert_allclose(shard.observations[mine][:, 4:], np.tile(scaled[order[row]], (steps, 1)), rtol=1e-6)
-        if begin + steps < length:
-            behind = None
-        else:
-            behind = shard.last_observations[slot]
+        behind = shard.last_observations[slot] if begin + steps == length else None
         if end == TRUNCATED:
             at = np.argwhere(shard.truncated).tolist().index([begin + steps - 1, slot])
             behind = shard.truncated_observations[at]
@@ -343,11 +344,11 @@ def test_a_shards_table_tells_what_its_arrays_hold() -> None:
 
 def test_a_shard_replays_by_hand_from_its_seeds() -> None:
     # Every episode, flown by the registered environment with the recorded actions, clipped, and the stated seed.
-    length, slots, seed, round, shard = 110, 3, 6, 2, 1
+    length, slots, seed = 110, 3, 6
     env = make_batched(POINTMASS, slots, context_visible=True)
-    weights, selection = falling(version=round), select(uniform(4))
-    told = collect(env, weights, selection, start=0, length=length, gamma=0.9, seed=seed, round=round, shard=shard)
-    seeds = episode_seeds(seed, Purpose.EPISODES, round, shard, count=slots * length)
+    weights, selection = falling(version=2), select(uniform(4))
+    told = collect(env, weights, selection, start=0, length=length, gamma=0.9, seed=seed, round=2, shard=1)
+    seeds = episode_seeds(seed, Purpose.EPISODES, 2, 1, count=slots * length)
     single = ContextObservation(gym.make(POINTMASS))
     for row in range(len(told.episodes)):
         begin, slot = told.episodes.starts[row], told.episodes.slots[row]
@@ -358,7 +359,7 @@ def test_a_shard_replays_by_hand_from_its_seeds() -> None:
             observation, reward, *_ = single.step(np.clip(told.actions[time, slot], -10.0, 10.0))
             assert told.rewards[time, slot] == reward
     # Actions are the policy's, with the stated noise.
-    noise = generator(seed, Purpose.ACTIONS, round, shard).standard_normal((length, slots, 2), dtype=np.float32)
+    noise = generator(seed, Purpose.ACTIONS, 2, 1).standard_normal((length, slots, 2), dtype=np.float32)
     means = forward(weights.actor, "tanh", told.observations.reshape(-1, 7)).reshape(length, slots, 2)
     np.testing.assert_allclose(told.actions, means + np.exp(weights.log_std) * noise, rtol=1e-5, atol=1e-5)
 
@@ -452,8 +453,7 @@ def test_evaluation_is_one_whole_episode_per_row(split: Any) -> None:
     np.testing.assert_allclose(told.returns, returns, rtol=1e-5)
     np.testing.assert_allclose(told.discounted_returns, discounted, rtol=1e-5)
     np.testing.assert_array_equal(told.success, success)
-    assert len(set(lengths)) > 2  # some crashed while others went on
-    assert 100 in lengths
+    assert min(lengths) < max(lengths) == 100  # some crashed while others went on
     again = joined([Worker(setup).evaluate(weights, split, part) for part in range(setup.evaluation_parts)])
     assert bits(again) == bits(told)
 
@@ -480,12 +480,12 @@ def test_more_parts_than_episodes() -> None:
 def test_measuring_never_touches_training() -> None:
     setup = setup_for(slots=5)  # as many slots as one part of the test split has episodes
     undisturbed, measured = Worker(setup), Worker(setup)
-    before = [bits(falls(undisturbed, round=round)) for round in range(3)]
+    before = [bits(falls(undisturbed, round=number)) for number in range(3)]
     after = []
-    for round in range(3):
+    for number in range(3):
         measured.evaluate(falling(), "test", 0)
         measured.start_values(falling(), 0)
-        after.append(bits(falls(measured, round=round)))
+        after.append(bits(falls(measured, round=number)))
         measured.evaluate(falling(), "train", 0)
     assert after == before
 
@@ -498,26 +498,28 @@ def lines(n: int, **changes: Any) -> Setup:
     return setup_for("tests.tiny_env:make", train=instances, test=instances, **changes)
 
 
-def test_start_values_are_means_over_seeded_starts() -> None:
-    setup = lines(10, start_states=1000)
-    assert (setup.chunk_size, setup.chunks) == (4, 3)
+def test_start_values_are_means_over_seeded_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("space_dist.rollout.CHUNK", 4096)  # a smaller one, or starts alone would take seconds
+    size, n = 4, 10
+    setup = lines(n, start_states=1000)
+    assert (setup.chunk_size, setup.chunks) == (size, 3)
     weights, worker = weights_for(2, 1), Worker(setup)
     told = [worker.start_values(weights, chunk) for chunk in range(setup.chunks)]
-    assert [len(chunk) for chunk in told] == [4, 4, 2]
-    expected = []
-    for instance, target in enumerate(setup.train.contexts):
-        chunk, place = divmod(instance, 4)
+    assert [len(chunk) for chunk in told] == [size, size, 2]
+    for instance in range(n):
+        chunk, place = divmod(instance, size)
         seeds = episode_seeds(3, Purpose.START_STATES, chunk, count=len(told[chunk]) * 1000)
-        env = tiny_env.make(1000)
         mine = seeds[1000 * place : 1000 * (place + 1)]
-        starts = env.reset(np.arange(1000), np.tile(target, (1000, 1)), mine)
-        observed = np.concatenate([starts, np.full((1000, 1), target, dtype=np.float32)], axis=1)
-        assert np.ptp(observed[:, 0]) > tiny_env.START
-        expected.append(values(weights, observed).astype(np.float64).mean())
-    np.testing.assert_allclose(np.concatenate(told), expected, rtol=1e-5)
-    assert [Worker(setup).start_values(weights, 1).tobytes(), told[0].tobytes()] == [
-        told[1].tobytes(), worker.start_values(weights, 0).tobytes()
-    ]  # fmt: skip
+        target = np.full((1000, 1), setup.train.contexts[instance, 0])
+        starts = tiny_env.make(1000).reset(np.arange(1000), target, mine)
+        assert np.ptp(starts) > tiny_env.START
+        observed = np.concatenate([starts, target], axis=1).astype(np.float32)
+        expected = values(weights, observed).astype(np.float64).mean()
+        assert told[chunk][place] == pytest.approx(expected, rel=1e-5)
+    # Whoever computes a chunk, in whatever order and how often, it has the same bits.
+    late = Worker(setup)
+    for chunk in (2, 0, 1, 0):
+        assert late.start_values(weights, chunk).tobytes() == told[chunk].tobytes()
 
 
 def test_joined_chunks_equal_one_big_evaluation() -> None:

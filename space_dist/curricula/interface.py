@@ -53,7 +53,7 @@ class State:
     size: S, the number of instances selected.
     selected: (size,) indices into the instance set, in walking order.
     tests, growths, stalled: how often growth was tested, how often it was granted, and the tests since it last was.
-    mean_value: mean |V| over the selected set as of the last iteration; None before the first.
+    mean_value: mean |V| over the set trained on in the last iteration, as of its end; None before the first.
     """
 
     version: int
@@ -68,8 +68,6 @@ class State:
 
 class Curriculum(Protocol):
     """Chooses what to train on next. Implementations hold the instance set and constants only, never a state."""
-
-    ranks_by_value: bool  # whether start values decide *which* instances are selected
 
     def start(self) -> tuple[State, Selection]:
         """The first selection, before anything was observed."""

@@ -14,8 +14,6 @@ from space_dist.seeding import Purpose, instance_keys
 class RoundRobin:
     """All instances, always. `seed` decides the order."""
 
-    ranks_by_value = False
-
     def __init__(self, instances: InstanceSet, *, seed: int) -> None:
         self._instances = instances
         self._order = np.argsort(instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts), kind="stable")

@@ -24,8 +24,6 @@ class Space:
     seed: decides the first instance and ties.
     """
 
-    ranks_by_value = True
-
     def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
         self._instances, self._eta, self._kappa = instances, eta, kappa
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
@@ -47,14 +45,15 @@ class Space:
         # Lines 7-8: if V_t is within eta of V_{t-1}, grow. Without a gradient step nothing was learnt that could
         # have settled.
         tested = feedback.gradient_steps > 0
-        grew = tested and abs(mean_after - mean_before) <= self._eta * max(mean_before, 1e-8)
-        size = min(state.size + self._kappa, n) if grew else state.size
+        settled = tested and abs(mean_after - mean_before) <= self._eta * max(mean_before, 1e-8)
+        size = min(state.size + self._kappa, n) if settled else state.size
+        grew = size > state.size
 
-        # Lines 10-11: d_t(i) := V_t(s0, c_i) - V_{t-1}(s0, c_i).
-        scores = self.scores(feedback)
+        # Lines 10-11: d_t(i) := V_t(s0, c_i) - V_{t-1}(s0, c_i), signed (Definition 1).
+        pic = feedback.values_after - feedback.values_before
 
         # Line 12: I_curr := the S instances with the highest d_t(i), best first.
-        selected = _highest(scores, size, self._ties)
+        selected = _highest(self._scores(pic, feedback.version), size, self._ties)
         chosen = self._membership(selected)
 
         new = dataclasses.replace(
@@ -66,7 +65,7 @@ class Space:
             tests=state.tests + tested,
             growths=state.growths + grew,
             stalled=0 if grew or size == n else state.stalled + tested,
-            mean_value=float(np.abs(feedback.values_after[chosen]).mean()),
+            mean_value=mean_after,
         )
         numbers: Numbers = {
             "size": size,
@@ -81,15 +80,15 @@ class Space:
             # Two other readings of lines 6-7 (docs/algorithm.md), logged so that they can be compared.
             "relative_change_as_printed": _relative_change(state.mean_value, mean_after),
             "relative_change_each": float(np.abs(after - before).mean()) / max(mean_before, 1e-8),
-            "largest_score": float(scores.max()),
-            "smallest_score": float(scores.min()),
+            "largest_pic": float(pic.max()),
+            "smallest_pic": float(pic.min()),
             "kept": int((trained & chosen).sum()),
         }
         return new, self.selection(new), numbers
 
-    def scores(self, feedback: Feedback) -> FloatArray:
-        """`(n,)` the performance improvement capacity d_t(i) of every instance (Definition 1), signed."""
-        return feedback.values_after - feedback.values_before
+    def _scores(self, pic: FloatArray, version: int) -> FloatArray:  # noqa: ARG002 - RandomGrowth needs the version
+        """`(n,)` what instances are ranked by: their performance improvement capacity."""
+        return pic
 
     def _membership(self, indices: IntArray) -> NDArray[np.bool_]:
         """`(n,)` whether an instance is among `indices`; means over it do not depend on their order."""
@@ -110,15 +109,13 @@ class Space:
 class RandomGrowth(Space):
     """A control: the set grows exactly when SPaCE's rule says so, but *which* instances are in it is random."""
 
-    ranks_by_value = False
-
     def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
         super().__init__(instances, eta=eta, kappa=kappa, seed=seed)
         self._random = instance_keys(seed, Purpose.RANDOM_GROWTH, instances.ids, instances.contexts)
 
-    def scores(self, feedback: Feedback) -> FloatArray:
+    def _scores(self, pic: FloatArray, version: int) -> FloatArray:  # noqa: ARG002 - whatever was learnt
         """`(n,)` random numbers, drawn afresh for every decision."""
-        return combine(self._random, feedback.version).astype(np.float64)
+        return combine(self._random, version).astype(np.float64)
 
 
 def _highest(scores: FloatArray, size: int, ties: UInt64Array) -> IntArray:

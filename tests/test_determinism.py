@@ -1,0 +1,96 @@
+"""A run is a pure function of (config, seed): not of workers, repetition, kills or resumption."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from space_dist.ledger import CURRICULUM, METRICS, Ledger
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
+
+
+def train(out: Path, learner: str, *arguments: str, seed: int = 0, workers: int = 0, resume: bool = False) -> list[str]:
+    settings = ["budget.steps=20000", "tracking.uri=null", "checkpoint.every_rounds=1"]
+    if learner == "trpo":  # the shipped config is PPO's: what only PPO has goes
+        settings.append(
+            "learner={kind: trpo, n_steps: 2048, gamma: 0.95, gae_lambda: 0.99, net_arch: [64, 64], "
+            "target_kl: 0.004}"
+        )
+    command = [sys.executable, "-m", "space_dist.cli", "train", str(ROOT / "configs/pointmass_space.yaml")]
+    command += ["--out", str(out), "--seed", str(seed), "--workers", str(workers), *arguments]
+    for setting in settings:
+        command += ["--set", setting]
+    return [*command, "--resume"] if resume else command
+
+
+def run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=250)
+    assert done.returncode == 0, done.stderr
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+@pytest.fixture(scope="module", params=["ppo", "trpo"])
+def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """An undisturbed run without Ray."""
+    folder = tmp_path_factory.mktemp(request.param) / "reference"
+    run(train(folder, request.param))
+    return request.param, folder
+
+
+@pytest.mark.ray
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_the_number_of_workers_changes_no_byte(reference: tuple[str, Path], workers: int, tmp_path: Path) -> None:
+    learner, folder = reference
+    run(train(tmp_path / "run", learner, workers=workers))
+    assert results(tmp_path / "run") == results(folder)
+
+
+def test_repeated_it_is_the_same_and_another_seed_is_not(reference: tuple[str, Path], tmp_path: Path) -> None:
+    learner, folder = reference
+    run(train(tmp_path / "again", learner))
+    run(train(tmp_path / "other", learner, seed=1))
+    assert results(tmp_path / "again") == results(folder)
+    for name, content in results(tmp_path / "other").items():
+        assert content != (folder / name).read_bytes(), name
+
+
+@pytest.mark.ray
+def test_killed_five_times_and_resumed_it_is_the_same(reference: tuple[str, Path], tmp_path: Path) -> None:
+    learner, folder = reference
+    out = tmp_path / "run"
+    moments = random.Random(f"kills of {learner}")
+    for kill, target in enumerate(sorted(moments.sample(range(1, 8), 5))):
+        # The last kills hit runs that have Ray actors, which must not outlive their driver.
+        process = subprocess.Popen(
+            train(out, learner, workers=2 if kill >= 3 else 0, resume=True),
+            cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        deadline = time.monotonic() + 120
+        while _round(out) < target and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.002)
+        time.sleep(moments.uniform(0.0, 0.1))
+        assert process.poll() is None, "the run ended before it could be killed"
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert Ledger(out).status().state == "running"  # nobody was left to say otherwise
+    run(train(out, learner, resume=True))
+    assert results(out) == results(folder)
+    assert Ledger(out).status().state == "done"
+
+
+def _round(folder: Path) -> int:
+    """Updates under the last checkpoint."""
+    names = sorted((folder / "checkpoints").glob("round-*.npz"))
+    return int(names[-1].stem.removeprefix("round-")) if names else 0
