@@ -18,11 +18,12 @@ from threadpoolctl import threadpool_limits
 
 import space_dist.cli  # noqa: F401 - one thread for all arithmetic, before NumPy is imported
 from space_dist import config as configs
+from space_dist.cluster import Central, InProcess
 from space_dist.errors import SpaceDistError
 from space_dist.instances import sample
 from space_dist.launch import private_ray
 from space_dist.rollout import Walk
-from space_dist.training import Central, InProcess, make_learner, make_setup
+from space_dist.training import make_learner, make_setup
 
 ROOT = Path(__file__).resolve().parent.parent
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)

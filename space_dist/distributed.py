@@ -1,4 +1,4 @@
-"""The same work on Ray actors: thin shells around `rollout.Worker` and `training.Central`.
+"""The same work on Ray actors: thin shells around `rollout.Worker` and `cluster.Central`.
 
 Nothing here decides a result. A shard may be computed by any actor; values flow from rollout actors to the curriculum
 actor, and its selection back to them, by object reference, without passing through the driver.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
@@ -17,16 +18,21 @@ os.environ.setdefault("RAY_DEDUP_LOGS", "0")
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
-from ray.exceptions import GetTimeoutError, RayError, RayTaskError
+from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
 from threadpoolctl import threadpool_limits
 
+from space_dist.cluster import Central, Decision, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.rollout import Setup, Split, Walk, Worker
-from space_dist.training import Central, Decision, Handle
 
 _OBJECT_STORE_BYTES = 256 << 20
 _START_SECONDS = 120.0
+_ATTEMPTS = 4
+_CENTRAL = -1
+_CENTRAL_ANSWERS = 4  # state, selection, numbers, values
+
+log = logging.getLogger("space_dist")
 
 
 class RolloutActor(Worker):
@@ -53,15 +59,35 @@ class CurriculumActor(Central):
         return True
 
 
+@dataclass
+class _Piece:
+    """A handle: where a value is, or will be. Recomputing the value moves it."""
+
+    ref: Any
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A call of an actor's method, kept until its answer has arrived so that it can be made again."""
+
+    actor: int  # of the rollout actors; _CENTRAL for the curriculum actor
+    method: str
+    arguments: tuple[Any, ...]
+    options: dict[str, Any]
+    answers: list[_Piece]
+
+
 class RayCluster:
     """Rollout actors and one curriculum actor; a context manager that leaves nothing behind.
 
-    Raises SpaceDistError if Ray cannot be reached or has no room for the actors.
+    An actor that dies is replaced, and what it owed is computed again: every call is a pure function, so nothing but
+    time is lost. Raises SpaceDistError if Ray cannot be reached or has no room for the actors.
     """
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
         self._config, self._setup = config, setup
-        self._workers: list[Any] = []
+        self._actors: dict[int, Any] = {}
+        self._unanswered: list[_Call] = []
 
     def __enter__(self) -> RayCluster:
         resources = self._config.resources
@@ -81,82 +107,119 @@ class RayCluster:
                 f"{str(error).splitlines()[0] if str(error) else type(error).__name__}"
             ) from error
         try:
-            self._start_actors(resources.workers)
+            self._setup_ref = ray.put(self._setup)
+            for index in (*range(resources.workers), _CENTRAL):
+                self._actors[index] = self._start_actor(index)
+            self._wait_until_ready()
         except BaseException:
             ray.shutdown()
             raise
         return self
 
-    def _start_actors(self, workers: int) -> None:
-        setup = ray.put(self._setup)
-        rollout = ray.remote(num_cpus=1, max_restarts=0)(RolloutActor)
-        self._workers = [rollout.remote(setup) for _ in range(workers)]
-        self._central: Any = ray.remote(num_cpus=0, max_restarts=0)(CurriculumActor).remote(self._config, setup)
-        try:
-            ray.get([actor.ready.remote() for actor in (*self._workers, self._central)], timeout=_START_SECONDS)
-        except GetTimeoutError:
-            total, free = _cpus()
-            raise SpaceDistError(
-                f"Ray did not start {workers} rollout actors of one CPU each within {_START_SECONDS:.0f} s; "
-                f"the cluster has {total:.0f} CPUs, {free:.0f} of them free"
-            ) from None
-        except RayTaskError as error:
-            raise _cause(error) from error
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for actor in (*self._workers, self._central):
+        for actor in self._actors.values():
             ray.kill(actor)
         ray.shutdown()
 
     def put(self, value: object) -> Handle:
-        """See `training.Cluster`."""
-        return ray.put(value)
+        """See `cluster.Cluster`."""
+        return _Piece(ray.put(value))
 
     def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
-        """See `training.Cluster`."""
-        return [
-            self._worker(shard).collect.remote(
-                weights, selection, walk, round=round, shard=shard, selection_version=version
-            )
-            for shard in range(self._setup.shards)
-        ]
+        """See `cluster.Cluster`."""
+        asked = {"round": round, "selection_version": version}
+        shards = range(self._setup.shards)
+        return [self._ask(shard, "collect", weights, selection, walk, shard=shard, **asked)[0] for shard in shards]
 
     def start_values(self, weights: Handle) -> list[Handle]:
-        """See `training.Cluster`."""
-        return [self._worker(chunk).start_values.remote(weights, chunk) for chunk in range(self._setup.chunks)]
+        """See `cluster.Cluster`."""
+        return [self._ask(chunk, "start_values", weights, chunk)[0] for chunk in range(self._setup.chunks)]
 
     def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
-        """See `training.Cluster`."""
+        """See `cluster.Cluster`."""
         parts = range(self._setup.evaluation_parts)
-        return [self._worker(part).evaluate.remote(weights, split, part) for part in parts]
+        return [self._ask(part, "evaluate", weights, split, part)[0] for part in parts]
 
     def begin(self, values: Sequence[Handle]) -> Decision:
-        """See `training.Cluster`."""
-        return Decision(*self._central.begin.options(num_returns=4).remote(*values))
+        """See `cluster.Cluster`."""
+        return Decision(*self._ask(_CENTRAL, "begin", *values))
 
     def decide(
         self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
     ) -> Decision:
-        """See `training.Cluster`."""
-        answer = self._central.decide.options(num_returns=4)
-        return Decision(*answer.remote(state, before, version, gradient_steps, *after))
+        """See `cluster.Cluster`."""
+        return Decision(*self._ask(_CENTRAL, "decide", state, before, version, gradient_steps, *after))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
-        """Wait for values. Raises SpaceDistError if an actor died or failed."""
-        try:
-            return list(ray.get(list(handles)))
-        except RayTaskError as error:
-            raise _cause(error) from error
-        except RayError as error:
-            raise SpaceDistError(
-                f"a part of the run on Ray was lost ({type(error).__name__}: {str(error).splitlines()[0][:200]}). "
-                "What was committed is intact; --resume continues"
-            ) from error
+        """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""
+        for _ in range(_ATTEMPTS):
+            try:
+                values = ray.get([handle.ref for handle in handles])
+            except RayTaskError as error:
+                raise _cause(error) from error
+            except RayError as error:
+                log.warning("lost a part of the run (%s); computing it again", type(error).__name__)
+                lost = error
+                self._replace_dead()
+                self._ask_again()
+            else:
+                self._unanswered.clear()
+                return list(values)
+        raise SpaceDistError(
+            f"the same work was lost {_ATTEMPTS} times ({type(lost).__name__}: {str(lost).splitlines()[0][:200]}). "
+            "What was committed is intact; --resume continues"
+        ) from lost
 
-    def _worker(self, piece: int) -> Any:
-        return self._workers[piece % len(self._workers)]
+    def _ask(self, piece: int, method: str, *arguments: Any, **options: Any) -> list[_Piece]:
+        actor = piece if piece == _CENTRAL else piece % self._config.resources.workers
+        answers = [_Piece(None) for _ in range(_CENTRAL_ANSWERS if actor == _CENTRAL else 1)]
+        call = _Call(actor, method, arguments, options, answers)
+        self._unanswered.append(call)
+        self._submit(call)
+        return answers
+
+    def _submit(self, call: _Call) -> None:
+        method = getattr(self._actors[call.actor], call.method).options(num_returns=len(call.answers))
+        arguments = [argument.ref if isinstance(argument, _Piece) else argument for argument in call.arguments]
+        refs = method.remote(*arguments, **call.options)
+        for piece, ref in zip(call.answers, refs if len(call.answers) > 1 else [refs], strict=True):
+            piece.ref = ref
+
+    def _ask_again(self) -> None:
+        for call in self._unanswered:  # in the order of submission, so that arguments are asked for before their users
+            self._submit(call)
+
+    def _replace_dead(self) -> None:
+        for index, actor in self._actors.items():
+            try:
+                ray.get(actor.ready.remote(), timeout=_START_SECONDS)
+            except RayActorError:
+                self._actors[index] = self._start_actor(index)
+            except GetTimeoutError:
+                ray.kill(actor)
+                self._actors[index] = self._start_actor(index)
+        self._wait_until_ready()
+
+    def _start_actor(self, index: int) -> Any:
+        # Never restarted by Ray: an actor that came back blank would go on silently.
+        if index == _CENTRAL:
+            return ray.remote(num_cpus=0, max_restarts=0)(CurriculumActor).remote(self._config, self._setup_ref)
+        return ray.remote(num_cpus=1, max_restarts=0)(RolloutActor).remote(self._setup_ref)
+
+    def _wait_until_ready(self) -> None:
+        try:
+            ray.get([actor.ready.remote() for actor in self._actors.values()], timeout=_START_SECONDS)
+        except GetTimeoutError:
+            total, free = _cpus()
+            raise SpaceDistError(
+                f"Ray did not start {self._config.resources.workers} rollout actors of one CPU each within "
+                f"{_START_SECONDS:.0f} s; the cluster has {total:.0f} CPUs, {free:.0f} of them free"
+            ) from None
+        except RayActorError as error:
+            cause = error.__cause__ if isinstance(error.__cause__, SpaceDistError) else None
+            raise cause or SpaceDistError(f"an actor died as it started: {str(error).splitlines()[0][:300]}") from error
 
 
 def _cpus() -> tuple[float, float]:

@@ -22,6 +22,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from space_dist import config as configs
+from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
@@ -29,7 +30,7 @@ from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
 from space_dist.rollout import MlpWeights, Setup, from_arrays
-from space_dist.training import Cluster, InProcess, Progress, Training, make_setup, policy_in
+from space_dist.training import Progress, Training, make_setup, policy_in
 
 log = logging.getLogger("space_dist")
 

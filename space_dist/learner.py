@@ -72,7 +72,7 @@ class Learner:
                 key=lambda name: int(name.rsplit(".", 1)[1]),
             )
             return tuple(
-                (np.ascontiguousarray(state[f"{name}.weight"].T), state[f"{name}.bias"].copy())
+                (np.array(state[f"{name}.weight"].T, order="C"), state[f"{name}.bias"].copy())
                 for name in [*names, head]
             )
 
@@ -93,6 +93,8 @@ class Learner:
         self.model._update_current_progress_remaining(steps, self._total_steps)
         with _seeded(self._seed, Purpose.UPDATE, round), _divergence_explained(round):
             self.model.train()
+            if not all(torch.isfinite(parameter).all() for parameter in self.model.policy.parameters()):
+                raise ValueError("a weight is not a number")
         recorded = self.model.logger.name_to_value
         metrics = {
             name.removeprefix("train/"): float(value)
@@ -141,10 +143,10 @@ class Learner:
     def save(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays and plain data from which `load` restores the learner bit for bit."""
         arrays: Arrays = {
-            f"policy/{name}": tensor.detach().numpy() for name, tensor in self.model.policy.state_dict().items()
+            f"policy/{name}": tensor.detach().numpy().copy() for name, tensor in self.model.policy.state_dict().items()
         }
         for index, slots in self.model.policy.optimizer.state_dict()["state"].items():
-            arrays |= {f"optimizer/{index}/{name}": tensor.numpy() for name, tensor in slots.items()}
+            arrays |= {f"optimizer/{index}/{name}": tensor.numpy().copy() for name, tensor in slots.items()}
         return arrays, {"n_updates": self.model._n_updates}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
@@ -226,11 +228,13 @@ def _seeded(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
 
 @contextmanager
 def _divergence_explained(round: int) -> Iterator[None]:
-    """Users need the cause: torch refuses distributions of NaN with a ValueError that names tensors."""
+    """Users need the cause: torch refuses distributions of NaN, and steps beyond float32, with errors about tensors."""
     try:
         yield
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "overflow" not in str(error):
+            raise
         raise SpaceDistError(
-            f"training diverged in update {round + 1}: the policy's outputs are no longer numbers. A smaller "
+            f"training diverged in update {round + 1}: the networks are no longer numbers. A smaller "
             f"learner.learning_rate usually helps ({str(error).splitlines()[0][:120]})"
         ) from error

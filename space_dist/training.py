@@ -21,28 +21,25 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from space_dist.cluster import Cluster, Decision, Handle, checked, make_curriculum
 from space_dist.config import RunConfig
-from space_dist.curricula import Curriculum, Feedback, RandomGrowth, RoundRobin, Selection, Space, State
+from space_dist.curricula import Selection, State
 from space_dist.envs import make_batched
-from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
 from space_dist.learner import Learner, Update
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Status
 from space_dist.rollout import (
     CUT,
-    FloatArray,
     MlpWeights,
     Outcomes,
     Setup,
     Shard,
-    Split,
     Walk,
-    Worker,
     joined,
     to_arrays,
 )
@@ -50,116 +47,6 @@ from space_dist.rollout import (
 log = logging.getLogger("space_dist")
 
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
-
-Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Handles of what a curriculum decided: its state, the selection, numbers for the log, and the values it saw."""
-
-    state: Handle
-    selection: Handle
-    numbers: Handle
-    values: Handle
-
-
-class Cluster(Protocol):
-    """Where work is done. All calls but `get` return at once; handles may be passed on without being waited for."""
-
-    def put(self, value: object) -> Handle:
-        """Make a value available to every worker."""
-
-    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
-        """One `Shard` per shard."""
-
-    def start_values(self, weights: Handle) -> list[Handle]:
-        """One array per chunk of the training instances."""
-
-    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
-        """One `Outcomes` per part."""
-
-    def begin(self, values: Sequence[Handle]) -> Decision:
-        """The curriculum's first decision."""
-
-    def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
-    ) -> Decision:
-        """The curriculum's next decision, on selection `version`."""
-
-    def get(self, handles: Sequence[Handle]) -> list[Any]:
-        """Wait for values."""
-
-
-class Central:
-    """The curriculum's seat: joins the values of all chunks and asks the curriculum. Pure; keeps no state."""
-
-    def __init__(self, config: RunConfig, train: InstanceSet) -> None:
-        self._curriculum = make_curriculum(config, train)
-
-    def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
-        """The first decision and V_0."""
-        state, selection = self._curriculum.start()
-        return state, selection, {}, _checked(np.concatenate(chunks))
-
-    def decide(
-        self, state: State, before: FloatArray, version: int, gradient_steps: int, *chunks: FloatArray
-    ) -> tuple[State, Selection, dict[str, Any], FloatArray]:
-        """The next decision and V_t. Raises RuntimeError if `state` is not the one that made selection `version`."""
-        if state.version != version:
-            raise RuntimeError(f"asked to go on from selection {version} with the state of {state.version}")
-        after = _checked(np.concatenate(chunks))
-        new, selection, numbers = self._curriculum.step(state, Feedback(version, before, after, gradient_steps))
-        return new, selection, numbers, after
-
-
-class InProcess:
-    """The cluster's twin without Ray: everything at once, here. Same bits."""
-
-    def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._setup, self._worker, self._central = setup, Worker(setup), Central(config, setup.train)
-
-    def put(self, value: object) -> Handle:
-        """The value itself."""
-        return value
-
-    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
-        """See `Cluster`."""
-        return [
-            self._worker.collect(weights, selection, walk, round=round, shard=shard, selection_version=version)
-            for shard in range(self._setup.shards)
-        ]
-
-    def start_values(self, weights: Handle) -> list[Handle]:
-        """See `Cluster`."""
-        return [self._worker.start_values(weights, chunk) for chunk in range(self._setup.chunks)]
-
-    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
-        """See `Cluster`."""
-        return [self._worker.evaluate(weights, split, part) for part in range(self._setup.evaluation_parts)]
-
-    def begin(self, values: Sequence[Handle]) -> Decision:
-        """See `Cluster`."""
-        return Decision(*self._central.begin(*values))
-
-    def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
-    ) -> Decision:
-        """See `Cluster`."""
-        return Decision(*self._central.decide(state, before, version, gradient_steps, *after))
-
-    def get(self, handles: Sequence[Handle]) -> list[Any]:
-        """The values themselves."""
-        return list(handles)
-
-
-def make_curriculum(config: RunConfig, train: InstanceSet) -> Curriculum:
-    """The curriculum a config asks for."""
-    settings = config.curriculum
-    if settings.kind == "round_robin":
-        return RoundRobin(train, seed=config.seed)
-    kind = Space if settings.kind == "space" else RandomGrowth
-    return kind(train, eta=settings.eta, kappa=settings.kappa, seed=config.seed)
 
 
 def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setup:
@@ -553,16 +440,6 @@ def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int, total_
     return min((evaluated_at // every_steps + 1) * every_steps, total_steps)
 
 
-def _checked(values: FloatArray) -> FloatArray:
-    """The values, if they are numbers. Raises SpaceDistError otherwise."""
-    if not np.isfinite(values).all():
-        raise SpaceDistError(
-            f"training diverged: the start values of {int((~np.isfinite(values)).sum())} instances are not finite. "
-            "A smaller learner.learning_rate usually helps"
-        )
-    return values
-
-
 def _rollout_sums(shards: list[Shard]) -> dict[str, float]:
     """Sums over a round's finished episodes (cut ones have no return), and how many there were."""
     sums = dict.fromkeys(("episodes", "cut", "finished", "return", "discounted_return", "length", "success"), 0.0)
@@ -581,15 +458,11 @@ def _rollout_sums(shards: list[Shard]) -> dict[str, float]:
 
 def _summary(outcomes: Outcomes, episodes: int) -> dict[str, Any]:
     """Means over a split, and each instance's mean return in id order."""
-
-    def mean(values: NDArray[Any]) -> float | None:
-        value = float(values.mean())
-        return value if math.isfinite(value) else None
-
+    returns = checked(outcomes.returns, "returns")
     return {
-        "return": mean(outcomes.returns),
-        "discounted_return": mean(outcomes.discounted_returns),
-        "length": mean(outcomes.lengths),
-        "success": mean(outcomes.success),
-        "returns": outcomes.returns.reshape(-1, episodes).mean(axis=1).tolist(),
+        "return": float(returns.mean()),
+        "discounted_return": float(outcomes.discounted_returns.mean()),
+        "length": float(outcomes.lengths.mean()),
+        "success": None if np.isnan(outcomes.success).any() else float(outcomes.success.mean()),
+        "returns": returns.reshape(-1, episodes).mean(axis=1).tolist(),
     }

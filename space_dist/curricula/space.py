@@ -30,7 +30,7 @@ class Space:
 
     def start(self) -> tuple[State, Selection]:
         """Lines 1-3: one instance, chosen by the seed. Line 1's S := 0 would empty the set: S starts at 1."""
-        state = State(version=0, order_version=0, size=1, selected=np.argmin(self._ties)[None])
+        state = State(version=0, order_version=0, size=1, selected=np.argsort(self._ties)[:1])
         return state, self.selection(state)
 
     def step(self, state: State, feedback: Feedback) -> tuple[State, Selection, Numbers]:

@@ -36,7 +36,7 @@ class SingleEnv(gym.Env[Any, Any]):
         """Start an episode; `seed` alone decides its noise. Raises ValueError for a context outside its bounds."""
         super().reset(seed=seed)
         if options is not None and "context" in options:
-            context = np.asarray(options["context"], dtype=np.float64)
+            context = np.array(options["context"], dtype=np.float64)
             if not self.context_space.contains(context):
                 raise ValueError(
                     f"context {np.array2string(context, threshold=10)} is not in {self.context_space}: "
@@ -67,11 +67,14 @@ class SingleEnv(gym.Env[Any, Any]):
         return self.np_random.uniform(bounds.low, bounds.high)
 
 
-class ContextObservation(gym.ObservationWrapper[NDArray[np.float32], Any, NDArray[np.float32]]):
+class ContextObservation(
+    gym.ObservationWrapper[NDArray[np.float32], Any, NDArray[np.float32]], gym.utils.RecordConstructorArgs
+):
     """Appends the context, scaled from `context_space` to [-1, 1], to a flat observation."""
 
     def __init__(self, env: gym.Env[NDArray[np.float32], Any]) -> None:
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.ObservationWrapper.__init__(self, env)
         inner, context = env.observation_space, env.get_wrapper_attr("context_space")
         if not isinstance(inner, spaces.Box) or len(inner.shape) != 1:
             raise TypeError(f"ContextObservation needs a flat Box observation space, not {inner}")

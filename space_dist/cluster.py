@@ -1,0 +1,138 @@
+"""Where a run's work is done: the protocol, the curriculum's seat, and the twin of the Ray cluster in this process.
+
+Imports neither Ray nor torch: rollout and curriculum actors are made of this module and `rollout`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from space_dist.config import RunConfig
+from space_dist.curricula import Curriculum, Feedback, RandomGrowth, RoundRobin, Selection, Space, State
+from space_dist.errors import SpaceDistError
+from space_dist.instances import InstanceSet
+from space_dist.rollout import FloatArray, Setup, Split, Walk, Worker
+
+Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Handles of what a curriculum decided: its state, the selection, numbers for the log, and the values it saw."""
+
+    state: Handle
+    selection: Handle
+    numbers: Handle
+    values: Handle
+
+
+class Cluster(Protocol):
+    """Where work is done. All calls but `get` return at once; handles may be passed on without being waited for."""
+
+    def put(self, value: object) -> Handle:
+        """Make a value available to every worker."""
+
+    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
+        """One `Shard` per shard."""
+
+    def start_values(self, weights: Handle) -> list[Handle]:
+        """One array per chunk of the training instances."""
+
+    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
+        """One `Outcomes` per part."""
+
+    def begin(self, values: Sequence[Handle]) -> Decision:
+        """The curriculum's first decision."""
+
+    def decide(
+        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
+    ) -> Decision:
+        """The curriculum's next decision, on selection `version`."""
+
+    def get(self, handles: Sequence[Handle]) -> list[Any]:
+        """Wait for values."""
+
+
+class Central:
+    """The curriculum's seat: joins the values of all chunks and asks the curriculum. Pure; keeps no state."""
+
+    def __init__(self, config: RunConfig, train: InstanceSet) -> None:
+        self._curriculum = make_curriculum(config, train)
+
+    def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
+        """The first decision and V_0."""
+        state, selection = self._curriculum.start()
+        return state, selection, {}, checked(np.concatenate(chunks), "start values")
+
+    def decide(
+        self, state: State, before: FloatArray, version: int, gradient_steps: int, *chunks: FloatArray
+    ) -> tuple[State, Selection, dict[str, Any], FloatArray]:
+        """The next decision and V_t. Raises RuntimeError if `state` is not the one that made selection `version`."""
+        if state.version != version:
+            raise RuntimeError(f"asked to go on from selection {version} with the state of {state.version}")
+        after = checked(np.concatenate(chunks), "start values")
+        new, selection, numbers = self._curriculum.step(state, Feedback(version, before, after, gradient_steps))
+        return new, selection, numbers, after
+
+
+class InProcess:
+    """The cluster's twin without Ray: everything at once, here. Same bits."""
+
+    def __init__(self, config: RunConfig, setup: Setup) -> None:
+        self._setup, self._worker, self._central = setup, Worker(setup), Central(config, setup.train)
+
+    def put(self, value: object) -> Handle:
+        """The value itself."""
+        return value
+
+    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
+        """See `Cluster`."""
+        return [
+            self._worker.collect(weights, selection, walk, round=round, shard=shard, selection_version=version)
+            for shard in range(self._setup.shards)
+        ]
+
+    def start_values(self, weights: Handle) -> list[Handle]:
+        """See `Cluster`."""
+        return [self._worker.start_values(weights, chunk) for chunk in range(self._setup.chunks)]
+
+    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
+        """See `Cluster`."""
+        return [self._worker.evaluate(weights, split, part) for part in range(self._setup.evaluation_parts)]
+
+    def begin(self, values: Sequence[Handle]) -> Decision:
+        """See `Cluster`."""
+        return Decision(*self._central.begin(*values))
+
+    def decide(
+        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
+    ) -> Decision:
+        """See `Cluster`."""
+        return Decision(*self._central.decide(state, before, version, gradient_steps, *after))
+
+    def get(self, handles: Sequence[Handle]) -> list[Any]:
+        """The values themselves."""
+        return list(handles)
+
+
+def make_curriculum(config: RunConfig, train: InstanceSet) -> Curriculum:
+    """The curriculum a config asks for."""
+    settings = config.curriculum
+    if settings.kind == "round_robin":
+        return RoundRobin(train, seed=config.seed)
+    kind = Space if settings.kind == "space" else RandomGrowth
+    return kind(train, eta=settings.eta, kappa=settings.kappa, seed=config.seed)
+
+
+def checked(values: FloatArray, what: str) -> FloatArray:
+    """The values, if they are numbers. Raises SpaceDistError otherwise."""
+    if not np.isfinite(values).all():
+        raise SpaceDistError(
+            f"training diverged: {int((~np.isfinite(values)).sum())} {what} are not finite numbers. A smaller "
+            "learner.learning_rate usually helps, unless the environment itself gives such rewards or observations"
+        )
+    return values

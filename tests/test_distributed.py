@@ -1,0 +1,133 @@
+"""Ray actors: what they import, and that losing one changes nothing but time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from space_dist import config as configs
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch, private_ray, read_instances
+from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.training import make_learner, make_setup
+
+ROOT = Path(__file__).resolve().parent.parent
+SMALL = [
+    "budget.steps=8192", "learner.n_steps=1024", "rollout.slots=2", "learner.n_epochs=2", "evaluation.every_steps=4000",
+    "tracking.uri=null",
+]  # fmt: skip
+
+pytestmark = pytest.mark.ray
+
+
+def config(workers: int) -> configs.RunConfig:
+    return configs.load(ROOT / "configs/pointmass_space.yaml", [*SMALL, f"resources.workers={workers}"])
+
+
+@pytest.fixture(scope="module")
+def cluster_class() -> Any:
+    private_ray()
+    from space_dist.distributed import RayCluster
+
+    return RayCluster
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("reference")
+    launch(config(0), folder, resume=True, stop=StopRequests())
+    return results(folder)
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in (METRICS, CURRICULUM, "model.npz")}
+
+
+def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -> None:
+    import ray
+
+    run = config(1)
+    setup = make_setup(run, *read_instances(run))
+    with cluster_class(run, setup) as cluster:
+        weights = cluster.put(make_learner(run).weights(0))
+        decision = cluster.begin(cluster.start_values(weights))
+        from space_dist.rollout import Walk
+
+        shards = cluster.collect(weights, decision.selection, Walk(-1, ()), round=0, version=0)
+        assert len(cluster.get([*shards, *cluster.evaluate(weights, "test")])) == 2 * run.rollout.shards
+        for actor in cluster._actors.values():
+            # By value: a function of this module would make the actor import it, and all that it imports.
+            names = ray.get(actor.__ray_call__.remote(lambda self: list(__import__("sys").modules)))
+            modules = {name.partition(".")[0] for name in names}
+            assert "numpy" in modules
+            assert not modules & {"torch", "stable_baselines3", "sb3_contrib", "mlflow"}
+
+
+@pytest.mark.parametrize("victims", [(0,), (-1,), (0, 1, -1)], ids=["a rollout actor", "the curriculum actor", "all"])
+def test_killed_actors_are_replaced_and_change_nothing(
+    victims: tuple[int, ...], cluster_class: Any, reference: dict[str, bytes], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    import ray
+
+    killed: list[int] = []
+    collect: Callable[..., list[Any]] = cluster_class.collect
+
+    def kill_then_collect(self: Any, *arguments: Any, round: int, version: int) -> list[Any]:
+        handles = collect(self, *arguments, round=round, version=version)
+        if round in (2, 5):  # while the shards, and the decision they need, are under way
+            for victim in victims:
+                ray.kill(self._actors[victim])
+                killed.append(victim)
+        return handles
+
+    monkeypatch.setattr(cluster_class, "collect", kill_then_collect)
+    launch(config(2), tmp_path, resume=True, stop=StopRequests())
+    assert killed == [*victims, *victims]
+    assert results(tmp_path) == reference
+    assert "computing it again" in (tmp_path / "log.txt").read_text()
+
+
+def test_an_actor_that_cannot_be_placed_is_an_error(cluster_class: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import ray
+
+    from space_dist import distributed
+    from space_dist.errors import SpaceDistError
+
+    run = config(2)
+    monkeypatch.setattr(distributed, "_START_SECONDS", 15.0)
+    started = ray.init
+    monkeypatch.setattr(ray, "init", lambda **options: started(**{**options, "num_cpus": 1}))
+    with pytest.raises(SpaceDistError, match="2 rollout actors of one CPU each"), cluster_class(run, _setup(run)):
+        pass
+    assert not ray.is_initialized()
+
+
+def _setup(run: configs.RunConfig) -> Any:
+    return make_setup(run, *read_instances(run))
+
+
+@pytest.mark.usefixtures("cluster_class")
+def test_a_stop_request_ends_a_run_on_ray_with_a_checkpoint(reference: dict[str, bytes], tmp_path: Path) -> None:
+    from space_dist.errors import Interrupted
+
+    def stop_soon() -> None:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / METRICS).exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        (tmp_path / "stop").touch()
+
+    thread = threading.Thread(target=stop_soon)
+    thread.start()
+    with pytest.raises(Interrupted):
+        launch(config(1), tmp_path, resume=True, stop=StopRequests())
+    thread.join()
+    status = Ledger(tmp_path).status()
+    assert (status.state, status.steps < 8192) == ("interrupted", True)
+    launch(config(0), tmp_path, resume=True, stop=StopRequests())
+    assert results(tmp_path) == reference
