@@ -11,9 +11,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from space_dist.config import RunConfig
-from space_dist.curricula import Curriculum, Feedback, RandomGrowth, RoundRobin, Selection, Space, State
-from space_dist.errors import SpaceDistError
+from space_dist.config import ContextSpaceConfig, FixedConfig, GrowingConfig, RandomGrowthConfig, RunConfig, SpaceConfig
+from space_dist.curricula import Curriculum, Feedback, RoundRobin, Selection, Space, State, variants
+from space_dist.envs import make_batched
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.rollout import FloatArray, Setup, Split, Walk, Worker
 
@@ -62,11 +63,13 @@ class Central:
 
     def __init__(self, config: RunConfig, train: InstanceSet) -> None:
         self._curriculum = make_curriculum(config, train)
+        self._from_zero = isinstance(config.curriculum, GrowingConfig) and config.curriculum.v0 == "zero"
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
         """The first decision and V_0."""
         state, selection = self._curriculum.start()
-        return state, selection, {}, checked(np.concatenate(chunks), "start values")
+        values = checked(np.concatenate(chunks), "start values")
+        return state, selection, {}, np.zeros_like(values) if self._from_zero else values
 
     def decide(
         self, state: State, before: FloatArray, version: int, gradient_steps: int, *chunks: FloatArray
@@ -120,12 +123,42 @@ class InProcess:
 
 
 def make_curriculum(config: RunConfig, train: InstanceSet) -> Curriculum:
-    """The curriculum a config asks for."""
+    """The curriculum a config asks for. Raises ConfigError if it asks for instances that are not there."""
     settings = config.curriculum
     if settings.kind == "round_robin":
         return RoundRobin(train, seed=config.seed)
-    kind = Space if settings.kind == "space" else RandomGrowth
-    return kind(train, eta=settings.eta, kappa=settings.kappa, seed=config.seed)
+    if settings.kind == "fixed":
+        _refuse_missing(settings, train, str(config.instances.train))
+        return RoundRobin(train, seed=config.seed, ids=settings.ids, count=settings.count)
+    return Space(
+        train, seed=config.seed, eta=settings.eta, kappa=settings.kappa, rank=_rank(config, settings, train),
+        mean=settings.mean, growth=settings.growth, adaptive_eta=settings.adaptive_eta, patience=settings.patience,
+        epsilon=settings.epsilon,
+    )  # fmt: skip
+
+
+def _rank(
+    config: RunConfig, settings: SpaceConfig | RandomGrowthConfig | ContextSpaceConfig, train: InstanceSet
+) -> variants.Rank:
+    if settings.kind == "cspace":
+        bounds = make_batched(config.env.id, 1, context_visible=False).context_bounds
+        by_distance = {"centroid": variants.near_centroid, "nearest_member": variants.near_member}
+        return by_distance[settings.distance](bounds.scale(train.contexts))
+    if settings.kind == "random_growth" or settings.pic == "random":
+        return variants.at_random(train, seed=config.seed)
+    return variants.BY_VALUE[settings.pic]
+
+
+def _refuse_missing(settings: FixedConfig, train: InstanceSet, source: str) -> None:
+    ids = train.ids.tolist()
+    holds = f"{source} holds {len(ids)} instances, with ids from {ids[0]} to {ids[-1]}"
+    if settings.count is not None and settings.count > len(ids):
+        raise ConfigError(f"curriculum.count: {settings.count} is too many: {holds}")
+    missing = sorted(set(settings.ids or ()).difference(ids))
+    if missing:
+        more = f" (nor {len(missing) - 1} more of these)" if len(missing) > 1 else ""
+        closest = min(ids, key=lambda one: abs(one - missing[0]))
+        raise ConfigError(f"curriculum.ids: there is no instance {missing[0]}{more}; the nearest is {closest}. {holds}")
 
 
 def checked(values: FloatArray, what: str) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
+import re
 import reprlib
 import types
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,12 +14,17 @@ from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
-from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.constructor import DuplicateKeyError, SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent
 
 from space_dist.errors import ConfigError, nearest
 
-_MAX_CONFIG_BYTES = 1 << 20
+_MAX_CONFIG_BYTES = 64 << 10
+_MAX_ALIASES = 20  # each may double what a file means
+_MAX_WORD = 100  # characters of a key
+_MAX_LIST = 10_000
+_MAX_BRACKETS = 200  # open at once
 _MAX_NESTING = 50
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
@@ -51,30 +56,80 @@ class InstancesConfig(_Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-class SpaceConfig(_Section):
-    """SPaCE (Eimer et al. 2021, Algorithm 1)."""
+class GrowingConfig(_Section):
+    """What all curricula share whose set grows by SPaCE's rule."""
 
-    kind: Literal["space"]
-    """Which curriculum: SPaCE."""
     eta: float = Field(default=0.1, gt=0.0)
     """Growth threshold: the set grows when the mean start value changed by at most this share. Source: the authors' run
     scripts use 0.1, section 5.6 recommends 0.05, appendix A (CartPole) uses 0.025."""
     kappa: int = Field(default=1, ge=1)
-    """Instances added per growth. Source: section 5.6 recommends 1."""
+    """Instances added per growth, or with growth: multiply the factor. Source: section 5.6 recommends 1."""
+    growth: Literal["add", "multiply", "schedule"] = "add"
+    """add: S + kappa. multiply: S * kappa (kappa of at least 2). Source: Algorithm 1; section 5.6, figure "fast rising
+    set size"."""
+    mean: Literal["same_set", "as_printed", "mean_abs_change"] = "same_set"
+    """What eta is compared with. same_set: change of the mean |V| over the set just trained on. as_printed: V_{t-1} is
+    the mean that the last iteration ended with, over its own set (at first 0). mean_abs_change: mean |change| of V, so
+    that opposite changes do not cancel. Source: ours; Algorithm 1, lines 6-7; ours."""
+    v0: Literal["network", "zero"] = "network"
+    """Start values before the first update. network: the initial network's. zero: 0 for every instance. Source: ours;
+    Algorithm 1, line 2, and the released code."""
+    adaptive_eta: Literal["off", "once", "persistent"] = "off"
+    """Raise eta so far that the set grows whenever `patience` tests in a row did not grow it: for that one test (once)
+    or for good (persistent). Source: Theorem 2, which names no schedule; off: the released code."""
+    patience: int = Field(default=5, ge=1)
+    """Tests in a row without growth that adaptive_eta waits for. Source: ours."""
+    epsilon: float = Field(default=1e-3, gt=0.0)
+    """Reward units: adaptive_eta raises eta to (|change| + epsilon) / max(V_{t-1}, epsilon). Source: Theorem 2 (any
+    number above 0); the value and the floor are ours."""
+
+    @model_validator(mode="after")
+    def _growth_is_possible(self) -> Self:
+        if self.growth == "multiply" and self.kappa < 2:
+            raise ValueError(f"growth: multiply with kappa: {self.kappa} never grows the set; it needs kappa >= 2")
+        if self.growth == "schedule" and self.adaptive_eta != "off":
+            raise ValueError(f"growth: schedule tests no eta that adaptive_eta: {self.adaptive_eta} could raise")
+        return self
+
+
+class SpaceConfig(GrowingConfig):
+    """SPaCE (Eimer et al. 2021, Algorithm 1)."""
+
+    kind: Literal["space"]
+    """Which curriculum: SPaCE."""
+    growth: Literal["add", "multiply"] = "add"
+    """add: S + kappa. multiply: S * kappa (kappa of at least 2). Source: Algorithm 1; section 5.6, figure "fast rising
+    set size"."""
+    pic: Literal["improvement", "abs", "relative", "lowest_value", "random"] = "improvement"
+    """What instances are ranked by. improvement: signed change of the start value, highest first. abs: its size.
+    relative: signed change / max(|value before|, 1e-8). lowest_value: lowest value first. random: nothing, a control.
+    Source: Definition 1; ours; the released code; the released code's default; ours."""
     allow_context_blind: bool = False
     """Run even though the policy cannot tell instances apart at their start (the released code's PointMass): all values
     tie, and the order is a random one."""
 
 
-class RandomGrowthConfig(_Section):
+class RandomGrowthConfig(GrowingConfig):
     """Control: grows exactly like SPaCE, but which instances are in the set is random."""
 
     kind: Literal["random_growth"]
-    """Which curriculum: random growth."""
-    eta: float = Field(default=0.1, gt=0.0)
-    """Growth threshold, as SPaCE's."""
-    kappa: int = Field(default=1, ge=1)
-    """Instances added per growth, as SPaCE's."""
+    """Which curriculum: random growth, which is SPaCE with pic: random."""
+    growth: Literal["add", "multiply"] = "add"
+    """add: S + kappa. multiply: S * kappa (kappa of at least 2). As SPaCE's."""
+
+
+class ContextSpaceConfig(GrowingConfig):
+    """cSPaCE: SPaCE that ranks by distance in context space instead of values (section 5.2)."""
+
+    kind: Literal["cspace"]
+    """Which curriculum: cSPaCE."""
+    growth: Literal["add", "multiply", "schedule"] = "add"
+    """add: S + kappa. multiply: S * kappa (kappa of at least 2). schedule: S + kappa after every iteration with a
+    gradient step, whatever the values; eta, mean and v0 then decide nothing. Source: the released code; as SPaCE's;
+    ours."""
+    distance: Literal["centroid", "nearest_member"] = "centroid"
+    """Euclidean distance, with each feature scaled from its bounds to [-1, 1], to what of the current set: its mean, or
+    its nearest instance, which never drops one. Source: the released code (with L1); ours."""
 
 
 class RoundRobinConfig(_Section):
@@ -84,7 +139,28 @@ class RoundRobinConfig(_Section):
     """Which curriculum: round robin."""
 
 
-CurriculumConfig = Annotated[SpaceConfig | RoundRobinConfig | RandomGrowthConfig, Field(discriminator="kind")]
+class FixedConfig(_Section):
+    """Control: round robin over a part of the training instances. Give either `ids` or `count`."""
+
+    kind: Literal["fixed"]
+    """Which curriculum: a fixed subset."""
+    ids: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(default=None, min_length=1, strict=False)
+    """Ids of the instances to train on. Source: ours."""
+    count: int | None = Field(default=None, ge=1)
+    """How many instances to train on: the first of round robin's order, so the seed chooses them. Source: ours."""
+
+    @model_validator(mode="after")
+    def _one_choice(self) -> Self:
+        if (self.ids is None) == (self.count is None):
+            raise ValueError("a fixed subset needs either ids or count")
+        if self.ids is not None and len(set(self.ids)) < len(self.ids):
+            raise ValueError("ids: every id may stand once")
+        return self
+
+
+CurriculumConfig = Annotated[
+    SpaceConfig | RoundRobinConfig | RandomGrowthConfig | ContextSpaceConfig | FixedConfig, Field(discriminator="kind")
+]
 
 
 class _OnPolicy(_Section):
@@ -369,54 +445,107 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > _MAX_CONFIG_BYTES:
-        raise ConfigError(f"{path} is larger than {_MAX_CONFIG_BYTES >> 20} MiB: that is no config")
+        raise ConfigError(f"{path} is larger than {_MAX_CONFIG_BYTES >> 10} KiB: that is no config")
     data = _parse_yaml(content, str(path))
     if not isinstance(data, dict):
         raise ConfigError(f"{path} must hold keys and values, like `name: my_run`; it holds {_short(data)}")
     return data
 
 
+class _Constructor(SafeConstructor):
+    """Numbers that cannot be read, and dates, stay words: the schema then says what is wrong, and with which key."""
+
+    def _number_or_word(self, node: Any) -> Any:
+        read = self.construct_yaml_int if node.tag.endswith(":int") else self.construct_yaml_float
+        try:
+            return read(node)
+        except ValueError:
+            return node.value
+
+
+_Constructor.add_constructor("tag:yaml.org,2002:int", _Constructor._number_or_word)
+_Constructor.add_constructor("tag:yaml.org,2002:float", _Constructor._number_or_word)
+_Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
+
+
+class _ValueFaultError(ValueError):
+    """A value that no config can hold; its text begins with the key."""
+
+
 def _parse_yaml(content: bytes | str, source: str) -> Any:
     try:
         text = content.decode() if isinstance(content, bytes) else content
         yaml = YAML(typ="safe", pure=True)
+        yaml.Constructor = _Constructor
         yaml.allow_duplicate_keys = False
+        _refuse_tricks(text, source)
         return _plain(yaml.load(text))
     except UnicodeDecodeError as error:
         raise ConfigError(f"{source} is not UTF-8 text (byte {error.start})") from None
     except DuplicateKeyError as error:
         where = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = str(error.problem).split(" with value")[0]
-        raise ConfigError(f"{source}{where}: {problem}: every key may stand once") from None
+        raise ConfigError(f"{source}{where}: {_clean(problem)}: every key may stand once") from None
     except YAMLError as error:
         mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
         where = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else str(error)
-        raise ConfigError(f"{source}{where} is not valid YAML: {str(problem).splitlines()[0][:200]}") from None
+        raise ConfigError(f"{source}{where} is not valid YAML: {_clean(str(problem))}") from None
+    except _ValueFaultError as error:
+        raise ConfigError(f"{source}: {error}") from None
     except RecursionError:
         raise ConfigError(f"{source} is nested too deeply") from None
-    except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, NotImplementedError) as error:
-        raise ConfigError(f"{source} is not valid YAML: {str(error)[:200]}") from None
+    except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, NotImplementedError,
+            AssertionError) as error:  # fmt: skip  # ruamel asserts that %YAML names a version it knows
+        raise ConfigError(f"{source} is not valid YAML: {_clean(str(error))}") from None
 
 
-def _plain(value: Any, depth: int = 0) -> Any:
+def _refuse_tricks(text: str, source: str) -> None:
+    """Refuse what makes a small file mean a large one, or name types. Raises ConfigError, RecursionError."""
+    depth = 0
+    for bracket in re.findall(r"[\[{}\]]", text):
+        depth += 1 if bracket in "[{" else -1
+        if depth > _MAX_BRACKETS:  # ruamel would take minutes to say so
+            raise RecursionError
+    aliases = 0
+    for event in YAML(typ="safe", pure=True).parse(text):
+        aliases += isinstance(event, AliasEvent)
+        tag = getattr(event, "tag", None)
+        if tag is not None and str(tag) != "!":
+            line = event.start_mark.line + 1
+            raise ConfigError(
+                f"{source}, line {line} is not valid YAML for a config: tags like {_clean(str(tag))!r} are not read"
+            )
+    if aliases > _MAX_ALIASES:
+        raise ConfigError(f"{source} has {aliases} aliases; at most {_MAX_ALIASES} are read")
+
+
+def _plain(value: Any, path: tuple[str, ...] = ()) -> Any:
     """Only what JSON knows, so that dates, sets and self-containing aliases cannot surprise anyone later."""
-    if depth > _MAX_NESTING:
+    if len(path) > _MAX_NESTING:
         raise RecursionError
+
+    def fault(what: str) -> ValueError:
+        return _ValueFaultError(f"{'.'.join(path) or 'the whole file'}: {what}")
+
     if isinstance(value, dict):
         for key in value:
-            if not isinstance(key, str):
-                raise ValueError(f"the key {_short(key)} is not a word")
-        return {str(key): _plain(item, depth + 1) for key, item in value.items()}
+            if not isinstance(key, str) or not key.isprintable() or len(key) > _MAX_WORD:
+                raise ValueError(f"{'.'.join(path)}: the key {_short(key)} is not a word".removeprefix(": "))
+        return {str(key): _plain(item, (*path, str(key))) for key, item in value.items()}
     if isinstance(value, list):
-        if len(value) > 10_000:
-            raise ValueError(f"a list of {len(value)} values")
-        return [_plain(item, depth + 1) for item in value]
+        if len(value) > _MAX_LIST:
+            raise fault(f"a list of {len(value)} values")
+        return [_plain(item, (*path, str(index))) for index, item in enumerate(value)]
+    if isinstance(value, str) and not value.isprintable():
+        raise fault(f"{_short(value)} holds characters that cannot be printed")
+    if isinstance(value, int) and abs(value) >= 1 << 63:
+        raise fault("a number of more than 63 bits")
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, float):
-        return int(value) if math.isfinite(value) and value.is_integer() else value  # 1e6 is how people write counts
-    raise ValueError(f"{_short(value)} is a {type(value).__name__}; write numbers, words, lists and keys only")
+        return int(value) if abs(value) < 1 << 63 and value.is_integer() else value  # 1e6 is how people write counts
+    raise fault(f"{_short(value)} is a {type(value).__name__}; write numbers, words, lists and keys only")
 
 
 def _apply(data: dict[str, Any], override: str) -> None:
@@ -425,8 +554,8 @@ def _apply(data: dict[str, Any], override: str) -> None:
     if not equals or not all(parts):
         raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
     value = _parse_yaml(text, f"--set {override}")
-    if parts[0] == "instances" and isinstance(value, str):
-        value = str(Path(value).absolute())
+    if parts[0] == "instances":
+        value = _from_here(value)
     section: Any = data
     for part in parts[:-1]:
         section = section.setdefault(part, {})
@@ -435,12 +564,24 @@ def _apply(data: dict[str, Any], override: str) -> None:
     section[parts[-1]] = value
 
 
+def _from_here(value: Any) -> Any:
+    """Instance paths of an override, relative to the current folder, as absolute ones."""
+    if isinstance(value, dict):
+        return {key: _from_here(item) for key, item in value.items()}
+    return str(Path(value).absolute()) if isinstance(value, str) and value else value
+
+
 def _explain(fault: Any, source: str, origins: Mapping[str, str]) -> str:
     path, model = _locate(fault["loc"])
     if fault["type"].startswith("union_tag"):
         path.append("kind")
     key = ".".join(path)
-    where = next((origin for name, origin in origins.items() if key == name or key.startswith(f"{name}.")), source)
+    related = (
+        origin
+        for name, origin in origins.items()
+        if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
+    )
+    where = next(related, source)
     kind, given = fault["type"], fault.get("input")
     context = fault.get("ctx", {})
     if kind == "extra_forbidden":
@@ -455,7 +596,9 @@ def _explain(fault: Any, source: str, origins: Mapping[str, str]) -> str:
         return f"{where}: {key}: {_short(given_kind)} is not known{hint} Allowed: {', '.join(tags)}"
     if kind == "value_error":
         message = str(context.get("error", fault["msg"]))
-        return f"{where}: {key}: {message}, not {_short(given)}" if key else f"{where}: {message}"
+        if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
+            return f"{where}: {key}: {message}" if key else f"{where}: {message}"
+        return f"{where}: {key}: {message}, not {_short(given)}"
     return f"{where}: {key or 'the whole file'}: {_short(given)}: {fault['msg']}"
 
 
@@ -518,6 +661,12 @@ def _type_name(field: Any) -> str:
     if name.startswith("tuple"):
         name = "list of int"
     return " ".join([name, *limits])
+
+
+def _clean(text: str) -> str:
+    """At most 200 characters of somebody else's text, none of which commands a terminal."""
+    line = (text.splitlines() or [""])[0][:200]
+    return "".join(character if character.isprintable() else repr(character)[1:-1] for character in line)
 
 
 def _short(value: object) -> str:

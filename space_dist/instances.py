@@ -401,6 +401,13 @@ POINTMASS_BOUNDS: Final = ContextBounds(
 )
 """PointMass (Klink et al. 2020): centre and width of the gate in the world's length units, friction in 1/s."""
 
+CARTPOLE_BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), high=np.array([1.0]))
+"""CartPole: *half* the pole's length in metres, as Gymnasium's `length` is. The bounds are ours.
+
+`configs/instances/cartpole_train.csv` holds the paper's three poles: 0.3, 0.4 and 0.5. The paper holds none out; the
+four of `cartpole_test.csv` are ours: one between each two of them, and one beyond each end.
+"""
+
 
 @dataclass(frozen=True)
 class Distribution:
@@ -439,6 +446,12 @@ DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
         source="Klink et al. 2020 (the target distribution); the clipping is ours",
         bounds=POINTMASS_BOUNDS,
         draw=_draw_pointmass_target,
+    ),
+    "cartpole_uniform": Distribution(
+        description="CartPole, half the pole's length uniform within its bounds",
+        source="ours; the paper has only the three poles of cartpole_train.csv and no test set",
+        bounds=CARTPOLE_BOUNDS,
+        draw=lambda rng, n: rng.uniform(CARTPOLE_BOUNDS.low, CARTPOLE_BOUNDS.high, size=(n, 1)),
     ),
 }
 

@@ -72,12 +72,18 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
             f"{config.env.id} ({horizon}): no episode could end. Use fewer shards or slots, or larger updates"
         )
     curriculum = config.curriculum
-    if curriculum.kind == "space" and not curriculum.allow_context_blind and _starts_alike(config, train):
+    if (
+        curriculum.kind == "space"
+        and curriculum.pic != "random"
+        and not curriculum.allow_context_blind
+        and _starts_alike(config, train)
+    ):
         raise ConfigError(
             "curriculum.kind: space ranks instances by the value of their start, but all instances start with the same "
             "observation, so all values tie and the order would be a random one. Set env.context_visible: true, or "
             "curriculum.allow_context_blind: true to run the released code's setting"
         )
+    make_curriculum(config, train)  # asks for instances that are not there? Better refused now than on an actor
     return setup
 
 

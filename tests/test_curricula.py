@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from space_dist.curricula import Curriculum, Feedback, RandomGrowth, RoundRobin, Selection, Space, State
+from space_dist.curricula import Curriculum, Feedback, RoundRobin, Selection, Space, State, variants
 from space_dist.curricula.space import _highest
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
 from space_dist.rollout import Walk
@@ -34,7 +34,8 @@ def make_set(n: int, order: Sequence[int] | None = None) -> InstanceSet:
 def make(kind: str, instances: InstanceSet, *, eta: float = 0.125, kappa: int = 1, seed: int = 0) -> Curriculum:
     if kind == "round_robin":
         return RoundRobin(instances, seed=seed)
-    return {"space": Space, "random_growth": RandomGrowth}[kind](instances, eta=eta, kappa=kappa, seed=seed)
+    rank = {"space": variants.improvement, "random_growth": variants.at_random(instances, seed=seed)}[kind]
+    return Space(instances, eta=eta, kappa=kappa, seed=seed, rank=rank)
 
 
 def feedback(state: State, before: Any, after: Any, gradient_steps: int = 1) -> Feedback:

@@ -2,6 +2,6 @@
 
 from space_dist.curricula.interface import Curriculum, Feedback, Selection, State
 from space_dist.curricula.round_robin import RoundRobin
-from space_dist.curricula.space import RandomGrowth, Space
+from space_dist.curricula.space import Space
 
-__all__ = ["Curriculum", "Feedback", "RandomGrowth", "RoundRobin", "Selection", "Space", "State"]
+__all__ = ["Curriculum", "Feedback", "RoundRobin", "Selection", "Space", "State"]

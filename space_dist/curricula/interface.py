@@ -54,6 +54,7 @@ class State:
     selected: (size,) indices into the instance set, in walking order.
     tests, growths, stalled: how often growth was tested, how often it was granted, and the tests since it last was.
     mean_value: mean |V| over the set trained on in the last iteration, as of its end; None before the first.
+    eta: the growth threshold in force, where it is adapted for good; None where it is the configured one.
     """
 
     version: int
@@ -64,6 +65,7 @@ class State:
     growths: int = 0
     stalled: int = 0
     mean_value: float | None = None
+    eta: float | None = None
 
 
 class Curriculum(Protocol):

@@ -1,8 +1,12 @@
-"""Round robin: every instance in turn, in one random order that never changes (the paper's first baseline)."""
+"""Round robin: every instance in turn, in one random order that never changes (the paper's first baseline).
+
+Over a part of the instances only, it is the control that trains on a fixed subset.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,32 +16,39 @@ from space_dist.seeding import Purpose, instance_keys
 
 
 class RoundRobin:
-    """All instances, always. `seed` decides the order."""
+    """The same instances, always: all of them, those with the given ids, or the first `count` of the order.
 
-    def __init__(self, instances: InstanceSet, *, seed: int) -> None:
+    `seed` decides the order. That of a subset is the whole set's with the others left out.
+    """
+
+    def __init__(
+        self, instances: InstanceSet, *, seed: int, ids: Sequence[int] | None = None, count: int | None = None
+    ) -> None:
         self._instances = instances
-        self._order = np.argsort(instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts), kind="stable")
+        order = np.argsort(instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts), kind="stable")
+        self._order = order[:count] if ids is None else order[np.isin(instances.ids[order], ids)]
 
     def start(self) -> tuple[State, Selection]:
         """The whole set, in its order."""
-        state = State(version=0, order_version=0, size=len(self._instances), selected=self._order)
+        state = State(version=0, order_version=0, size=len(self._order), selected=self._order)
         return state, self.selection(state)
 
     def step(self, state: State, feedback: Feedback) -> tuple[State, Selection, Numbers]:
         """The same set again; values are reported, not used."""
-        mean_after = float(np.abs(feedback.values_after).mean())
+        trained = np.sort(state.selected)  # a mean must not depend on the order
+        mean_after = float(np.abs(feedback.values_after[trained]).mean())
         new = dataclasses.replace(state, version=state.version + 1, mean_value=mean_after)
         numbers: Numbers = {
             "size": state.size,
             "trained_size": state.size,
             "grew": False,
-            "mean_value_before": float(np.abs(feedback.values_before).mean()),
+            "mean_value_before": float(np.abs(feedback.values_before[trained]).mean()),
             "mean_value_after": mean_after,
         }
         return new, self.selection(new), numbers
 
     def selection(self, state: State) -> Selection:
-        """Every instance, in the run's order; `order_version` stays, so the walk never starts over."""
+        """The set in the run's order; `order_version` stays, so the walk never starts over."""
         return Selection(
             version=state.version,
             ids=self._instances.ids[state.selected],

@@ -1,7 +1,8 @@
 """SPaCE: Self-Paced Context Evaluation (Eimer et al., ICML 2021, Algorithm 1).
 
 `Space.step` is lines 6-13 of Algorithm 1, in order; line 5 (collect and update) is `training.py`. docs/algorithm.md
-maps the lines and names every place where the paper is silent or contradicts itself.
+maps the lines and names every place where the paper is silent or contradicts itself. The defaults are the paper's
+SPaCE; what the named variants do instead is in `variants.py`.
 """
 
 from __future__ import annotations
@@ -9,23 +10,43 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, State
+from space_dist.curricula.variants import AdaptiveEta, Growth, Mean, Members, Rank, grown, improvement, readings
 from space_dist.instances import InstanceSet
-from space_dist.seeding import Purpose, UInt64Array, combine, instance_keys
+from space_dist.seeding import Purpose, UInt64Array, instance_keys
 
 
 class Space:
     """The instances whose start value rose most, from a set that grows whenever values settle.
 
+    seed: decides the first instance and ties.
     eta: growth threshold: the relative change of the mean start value below which the set grows (paper: eta).
     kappa: how many instances a growth adds (paper: kappa).
-    seed: decides the first instance and ties.
+    rank: what line 12 ranks by (paper: d_t(i)).
+    mean: which reading of lines 6-7 decides.
+    growth: `multiply` multiplies the size by kappa; `schedule` adds kappa without asking the values.
+    adaptive_eta, patience, epsilon: Theorem 2: behind `patience` tests in a row without growth, the next one is made
+        with an eta that lets the set grow; `persistent` never lowers it again.
     """
 
-    def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
+    def __init__(
+        self,
+        instances: InstanceSet,
+        *,
+        seed: int,
+        eta: float,
+        kappa: int,
+        rank: Rank = improvement,
+        mean: Mean = "same_set",
+        growth: Growth = "add",
+        adaptive_eta: AdaptiveEta = "off",
+        patience: int = 5,
+        epsilon: float = 1e-3,
+    ) -> None:
         self._instances, self._eta, self._kappa = instances, eta, kappa
+        self._rank, self._mean, self._growth = rank, mean, growth
+        self._adaptive_eta, self._patience, self._epsilon = adaptive_eta, patience, epsilon
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
 
     def start(self) -> tuple[State, Selection]:
@@ -39,21 +60,28 @@ class Space:
         before, after = feedback.values_before[trained], feedback.values_after[trained]
 
         # Line 6: V_t := mean |V_t(s0, c_i)|. V_{t-1} is taken over the same instances, or the comparison in line 7
-        # would mix a change of values with a change of set.
-        mean_before, mean_after = float(np.abs(before).mean()), float(np.abs(after).mean())
+        # would mix a change of values with a change of set. (`mean` names other readings.)
+        mean_after = float(np.abs(after).mean())
+        read = readings(before, after, state.mean_value)
+        reading = read[self._mean]
 
-        # Lines 7-8: if V_t is within eta of V_{t-1}, grow. Without a gradient step nothing was learnt that could
-        # have settled.
+        # Line 7: is V_t within eta of V_{t-1}? Without a gradient step nothing was learnt that could have settled.
         tested = feedback.gradient_steps > 0
-        settled = tested and abs(mean_after - mean_before) <= self._eta * max(mean_before, 1e-8)
-        size = min(state.size + self._kappa, n) if settled else state.size
+        eta = self._eta if state.eta is None else state.eta
+        settled = tested and (self._growth == "schedule" or reading.within(eta))
+        if tested and not settled and self._adaptive_eta != "off" and state.stalled >= self._patience:
+            # Theorem 2. That the set grows now must not hang on how the raised eta is rounded.
+            eta, settled = max(eta, reading.eta_to_grow(self._epsilon)), True
+
+        # Line 8: S := S + kappa.
+        size = min(grown(self._growth, state.size, self._kappa), n) if settled else state.size
         grew = size > state.size
 
         # Lines 10-11: d_t(i) := V_t(s0, c_i) - V_{t-1}(s0, c_i), signed (Definition 1).
         pic = feedback.values_after - feedback.values_before
 
-        # Line 12: I_curr := the S instances with the highest d_t(i), best first.
-        selected = _highest(self._scores(pic, feedback.version), size, self._ties)
+        # Line 12: I_curr := the S instances with the highest d_t(i), or what else `rank` scores, best first.
+        selected = _highest(self._rank(feedback, trained), size, self._ties)
         chosen = self._membership(selected)
 
         new = dataclasses.replace(
@@ -66,6 +94,7 @@ class Space:
             growths=state.growths + grew,
             stalled=0 if grew or size == n else state.stalled + tested,
             mean_value=mean_after,
+            eta=eta if self._adaptive_eta == "persistent" else None,
         )
         numbers: Numbers = {
             "size": size,
@@ -74,23 +103,20 @@ class Space:
             "tests": new.tests,
             "growths": new.growths,
             "stalled": new.stalled,
-            "mean_value_before": mean_before,
+            "mean_value_before": read["same_set"].reference,
             "mean_value_after": mean_after,
-            "relative_change": _relative_change(mean_before, mean_after),
-            # Two other readings of lines 6-7 (docs/algorithm.md), logged so that they can be compared.
-            "relative_change_as_printed": _relative_change(state.mean_value, mean_after),
-            "relative_change_each": float(np.abs(after - before).mean()) / max(mean_before, 1e-8),
+            "eta": eta if tested and self._growth != "schedule" else None,
+            # Every reading of lines 6-7, so that they can be compared; `mean` says which one decided.
+            "relative_change": read["same_set"].relative(),
+            "relative_change_as_printed": None if state.mean_value is None else read["as_printed"].relative(),
+            "relative_change_each": read["mean_abs_change"].relative(),
             "largest_pic": float(pic.max()),
             "smallest_pic": float(pic.min()),
             "kept": int((trained & chosen).sum()),
         }
         return new, self.selection(new), numbers
 
-    def _scores(self, pic: FloatArray, version: int) -> FloatArray:  # noqa: ARG002 - RandomGrowth needs the version
-        """`(n,)` what instances are ranked by: their performance improvement capacity."""
-        return pic
-
-    def _membership(self, indices: IntArray) -> NDArray[np.bool_]:
+    def _membership(self, indices: IntArray) -> Members:
         """`(n,)` whether an instance is among `indices`; means over it do not depend on their order."""
         members = np.zeros(len(self._instances), dtype=np.bool_)
         members[indices] = True
@@ -104,18 +130,6 @@ class Space:
             contexts=np.take(self._instances.contexts, state.selected, axis=0),
             order_version=state.order_version,
         )
-
-
-class RandomGrowth(Space):
-    """A control: the set grows exactly when SPaCE's rule says so, but *which* instances are in it is random."""
-
-    def __init__(self, instances: InstanceSet, *, eta: float, kappa: int, seed: int) -> None:
-        super().__init__(instances, eta=eta, kappa=kappa, seed=seed)
-        self._random = instance_keys(seed, Purpose.RANDOM_GROWTH, instances.ids, instances.contexts)
-
-    def _scores(self, pic: FloatArray, version: int) -> FloatArray:  # noqa: ARG002 - whatever was learnt
-        """`(n,)` random numbers, drawn afresh for every decision."""
-        return combine(self._random, version).astype(np.float64)
 
 
 def _highest(scores: FloatArray, size: int, ties: UInt64Array) -> IntArray:
@@ -132,8 +146,3 @@ def _highest(scores: FloatArray, size: int, ties: UInt64Array) -> IntArray:
         members = tied[1:] | tied[:-1]
         order[members] = order[members][np.lexsort((ties[order[members]], -ranked[members]))]
     return order[:size]
-
-
-def _relative_change(before: float | None, after: float) -> float | None:
-    """|after - before| as a share of `before`; None where there is no `before` yet."""
-    return None if before is None else abs(after - before) / max(before, 1e-8)

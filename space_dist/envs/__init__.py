@@ -8,12 +8,16 @@ from typing import Any
 
 import gymnasium as gym
 
+from space_dist.envs.cartpole import BatchedCartPole
 from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.errors import ConfigError, nearest
 
-BATCHED: dict[str, Callable[[int], BatchedEnv]] = {"space_dist/PointMass-v0": BatchedPointMass}
+BATCHED: dict[str, Callable[[int], BatchedEnv]] = {
+    "space_dist/PointMass-v0": BatchedPointMass,
+    "space_dist/CartPole-v0": BatchedCartPole,
+}
 
 
 def make_single(env_id: str) -> SingleEnv:
@@ -60,6 +64,7 @@ def _find(env_id: str) -> Callable[[int], Any]:
 
 
 __all__ = [
+    "BatchedCartPole",
     "BatchedEnv",
     "BatchedPointMass",
     "ContextObservation",

@@ -1,0 +1,333 @@
+"""The command line as a user meets it: exit codes, one clear sentence, never a traceback, and nothing lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from space_dist import cli
+from space_dist.ledger import CURRICULUM, METRICS, Ledger
+
+ROOT = Path(__file__).resolve().parent.parent
+CONFIG = ROOT / "configs/pointmass_space.yaml"
+TRAIN, TEST = (ROOT / f"configs/instances/pointmass_uniform_{split}.csv" for split in ("train", "test"))
+SMALL = (
+    "budget.steps=8192", "learner.n_steps=512", "rollout.slots=1", "learner.n_epochs=1", "tracking.uri=null",
+    "checkpoint.every_rounds=1", "evaluation.every_steps=3000", "resources.workers=0",
+)  # fmt: skip
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit code, output and errors of one command, in this process."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
+    sys.argv[1:] = [str(argument) for argument in arguments]
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as error:
+        code = int(error.code or 0)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err + captured.out
+    return code, captured.out, captured.err
+
+
+@pytest.fixture(autouse=True)
+def _own_arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["space-dist"])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(cli, "STOP", cli.StopRequests())
+    monkeypatch.chdir(tmp_path)
+
+
+def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[object]:
+    chosen = [*SMALL, *settings]
+    return ["train", config, "--out", out, *(part for setting in chosen for part in ("--set", setting))]
+
+
+# ---- what a user can get wrong ----
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "missing.yaml"], ["missing.yaml", "does not exist"]),
+        (["train", "."], ["is a folder"]),
+        (["train", "/dev/null"], ["/dev/null", "not a regular file"]),
+        (train("learner.n_stesp=3"), ["--set learner.n_stesp=3", "did you mean 'n_steps'?"]),
+        (train("budget.steps"), ["--set", "KEY=VALUE"]),
+        (train("curriculum.eta=-1"), ["curriculum.eta", "-1", "greater than 0"]),
+        (train("resources.workers=-1"), ["resources.workers", "-1"]),
+        (train("name=../../etc/passwd"), ["name", "etc/passwd"]),
+        (train("env.id=space_dist/PointMas-v0"), ["env.id", "did you mean 'space_dist/PointMass-v0'?"]),
+        (train("env.id=no_such_module:make"), ["env.id", "no_such_module"]),
+        (train("env.id=os:no_such_function"), ["env.id", "no_such_function"]),
+        (train("env.kwargs={no_such: 1}"), ["env.kwargs", "no_such"]),
+        (train("env.context_visible=false"), ["all values tie", "env.context_visible"]),
+        (train("learner.n_steps=256"), ["horizon", "(100)", "64 steps per slot"]),
+        (train("learner.kind=dqn"), ["learner"]),
+        (train("instances.train=nowhere.csv"), ["nowhere.csv"]),
+        (train(f"instances.train={TEST}"), ["overlap", "id 100"]),
+        (train("tracking.uri=mysql://x"), ["tracking.uri", "sqlite:///FILE"]),
+        (["train", CONFIG, "--workers", "many"], ["--workers"]),
+        (["train", CONFIG, "--no-such-option"], ["no-such-option"]),
+        (["no-such-command"], ["no-such-command"]),
+        (["instances", "sample", "pointmass_unifrom", "--out", "x"], ["did you mean 'pointmass_uniform'?"]),
+        (["instances", "check", "nowhere.csv"], ["nowhere.csv"]),
+        (["instances", "check", str(TRAIN), str(TRAIN)], ["overlap"]),
+    ],
+    ids=lambda value: " ".join(map(str, value[-1:])) if isinstance(value, list) else None,
+)
+def test_a_mistake_is_one_clear_sentence_and_exit_code_2(
+    capsys: pytest.CaptureFixture[str], arguments: list[object], said: list[str]
+) -> None:
+    code, _, error = run(capsys, *arguments)
+    assert code == 2, error
+    text = " ".join(error.replace("│", " ").split())
+    for part in said:
+        assert part in text
+    assert not Path("run").exists()  # nothing was begun
+
+
+MODULES = {
+    "fails_to_import": "raise ImportError('no such library')",
+    "divides_at_import": "1 / 0",
+    "is_no_python": "def (",
+    "fails_to_make": "def make(n_slots):\n    raise KeyError('slots')",
+    "makes_junk": "def make(n_slots):\n    return 3",
+    "takes_nothing": "def make():\n    return 3",
+    "exits": "raise SystemExit(0)",
+}
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_a_users_broken_environment_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f"{module}.py").write_text(MODULES[module])
+    monkeypatch.syspath_prepend(tmp_path)
+    code, _, error = run(capsys, *train(f"env.id={module}:make"))
+    assert code == 2
+    assert "env.id" in error
+    assert module in error
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_broken_files_are_refused_by_name(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, data: st.DataObject
+) -> None:
+    """60 broken configs and 60 broken instance files."""
+    text = CONFIG.read_text().splitlines()
+    place = data.draw(st.integers(9, len(text) - 1))
+    junk = st.sampled_from(["{", "- 1", "a: b: c", "\t", "'", "!!python/none", "? x", "&a *a", "[", "x\0"])
+    text.insert(place, data.draw(junk))
+    config = tmp_path / "broken.yaml"
+    config.write_text("\n".join(text).replace("instances/", f"{ROOT}/configs/instances/"))
+    code, _, error = run(capsys, *train(config=config))
+    assert code == 2
+    assert "broken.yaml" in error
+
+    rows = TRAIN.read_text().splitlines()
+    row = data.draw(st.integers(0, 20))
+    cell = st.sampled_from(["nan", "inf", "-9", "1e400", "x", "", "1,2", "\0", "1_0", "id"])
+    rows[row] = rows[row].rsplit(",", 1)[0] + "," + data.draw(cell)
+    instances = tmp_path / "broken.csv"
+    instances.write_text("\n".join(rows))
+    code, _, error = run(capsys, *train(f"instances.train={instances}"))
+    assert code == 2
+    assert "broken.csv" in error
+    assert f"row {row + 1}" in error
+
+
+# ---- runs, and coming back to them ----
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small run, left alone."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(out=folder))]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert len(done.stdout.splitlines()) == 1  # quiet when not a terminal
+    return folder
+
+
+def same(one: Path, other: Path) -> bool:
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in (METRICS, CURRICULUM, "model.npz"))
+
+
+def test_a_run_that_is_there_is_neither_overwritten_nor_repeated(
+    capsys: pytest.CaptureFixture[str], finished: Path
+) -> None:
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    code, _, error = run(capsys, *train(out=finished))
+    assert (code, "--resume" in error) == (2, True)
+    code, _, error = run(capsys, *train("curriculum.eta=0.2", "budget.steps=9000", out=finished), "--resume")
+    assert code == 2
+    assert "curriculum.eta: 0.1 -> 0.2" in error
+    assert "budget.steps: 8192 -> 9000" in error
+    code, out, _ = run(capsys, *train(out=finished), "--resume")
+    assert (code, "already done" in out) == (0, True)
+    after = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    before.pop(finished / "lock.json"), after.pop(finished / "lock.json")
+    assert after == before
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, "file"])
+def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
+    capsys: pytest.CaptureFixture[str], finished: Path, tmp_path: Path, how: signal.Signals | str
+) -> None:
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(out=folder))]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    deadline = time.monotonic() + 60
+    while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    if isinstance(how, signal.Signals):
+        process.send_signal(how)
+    else:
+        (folder / "stop").touch()
+    _, error = process.communicate(timeout=60)
+    status = Ledger(folder).status()
+    assert (process.returncode, status.state) == (75, "interrupted"), error
+    assert 0 < status.steps < 8192
+    assert "--resume continues" in error
+    code, _, _ = run(capsys, *train(out=folder), "--resume")
+    assert code == 0
+    assert same(folder, finished)
+
+
+def test_a_second_process_on_the_same_run_refuses(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train("budget.steps=10000000", out=folder))]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
+        try:
+            deadline = time.monotonic() + 60
+            while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
+                time.sleep(0.01)
+            code, _, error = run(capsys, *train("budget.steps=10000000", out=folder), "--resume")
+            assert code == 1
+            assert f"process {first.pid}" in error
+            assert first.poll() is None
+        finally:
+            first.kill()
+
+
+def test_a_round_longer_than_the_grace_time_ends_on_the_last_checkpoint(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    settings = ("resources.grace_seconds=0.3",)
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(*settings, out=folder))]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGSTOP)  # as if the round took for ever
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGCONT)
+    assert process.wait(timeout=60) == 75
+    done = subprocess.run([*command, "--resume"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert same(folder, finished)
+
+
+# ---- what comes after a run ----
+
+
+def test_evaluate_gives_what_the_final_evaluation_of_a_policy_could_give(
+    capsys: pytest.CaptureFixture[str], finished: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results.csv"
+    code, out, _ = run(capsys, "evaluate", finished, "--instances", TEST, "--json", "--out", results)
+    assert code == 0
+    answer = json.loads(out)
+    assert (answer["n_instances"], answer["steps"]) == (100, 8192)
+    rows = results.read_text().splitlines()
+    assert rows[0] == "id,return,discounted_return,length,success"
+    returns = [float(row.split(",")[1]) for row in rows[1:]]
+    assert answer["return"] == pytest.approx(sum(returns) / 100)
+    last = Ledger(finished).rows()[-1]["test"]["return"]
+    assert answer["return"] == pytest.approx(last, rel=0.2)  # the same policy and instances, other noise
+    assert run(capsys, "evaluate", finished, "--instances", TEST, "--json")[1] == out
+
+
+def test_evaluate_uses_the_last_checkpoint_of_an_unfinished_run(
+    capsys: pytest.CaptureFixture[str], finished: Path, tmp_path: Path
+) -> None:
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    (copy / "model.npz").unlink()
+    whole = run(capsys, "evaluate", finished, "--instances", TEST, "--json")[1]
+    from_checkpoint = run(capsys, "evaluate", copy, "--instances", TEST, "--json")[1]
+    assert json.loads(from_checkpoint)["return"] == json.loads(whole)["return"]
+    (copy / "model.npz").write_bytes(b"PK\x03\x04 nonsense")
+    code, _, error = run(capsys, "evaluate", copy, "--instances", TEST)
+    assert (code, "damaged" in error) == (1, True)
+
+
+@pytest.mark.parametrize("command", ["report", "sync"])
+def test_folders_without_runs_are_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str) -> None:
+    code, _, error = run(capsys, command, tmp_path)
+    assert code == 1
+    assert str(tmp_path) in error.replace("\n", "")
+
+
+def test_evaluate_without_a_run_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    code, _, error = run(capsys, "evaluate", tmp_path, "--instances", TEST)
+    assert (code, "holds no run" in error) == (1, True)
+
+
+def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, _, error = run(capsys, *train(out=tmp_path / "file" / "run"))
+    assert (code, "cannot write to the run folder" in error) == (1, True)
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    if os.access(locked, os.W_OK):
+        pytest.skip("root may write anywhere")
+    code, _, error = run(capsys, *train(out=locked / "run"))
+    assert (code, "permission denied" in error) == (1, True)
+
+
+def test_a_dead_tracking_server_costs_a_warning_and_nothing_else(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train("tracking.uri=http://127.0.0.1:9", out=folder))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    assert "warning: MLflow at http://127.0.0.1:9 could not be brought up to date" in done.stderr
+    assert same(folder, finished)
+
+
+def test_schema_and_check_explain_the_config(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "config", "schema")
+    assert code == 0
+    assert "curriculum.kappa" in out
+    code, out, _ = run(capsys, "config", "check", CONFIG)
+    assert code == 0
+    assert "name: pointmass_space" in out
+
+
+def test_sampled_instances_are_checked_and_never_overwritten(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    sampled = ["instances", "sample", "pointmass_uniform", "--train", 5, "--test", 3, "--out", tmp_path / "sets"]
+    assert run(capsys, *sampled)[0] == 0
+    files = sorted((tmp_path / "sets").iterdir())
+    assert run(capsys, "instances", "check", *files)[0] == 0
+    code, _, error = run(capsys, *sampled)
+    assert (code, "exists" in error) == (2, True)
