@@ -101,22 +101,21 @@ def evaluate(
     import numpy as np
 
     from space_dist import config as configs
-    from space_dist.envs import make_batched
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of
     from space_dist.ledger import Ledger
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
+    from space_dist.training import make_env
 
     ledger = Ledger(run)
     status = ledger.status()
     config = configs.load(ledger.config)
-    weights = policy_of(ledger)
-    env_one = make_batched(config.env.id, 1, context_visible=False)
-    chosen = read_csv(instances, env_one.context_bounds)
-    env = make_batched(config.env.id, len(chosen), context_visible=config.env.context_visible)
+    policy = policy_of(ledger)
+    chosen = read_csv(instances, make_env(config).context_bounds)
+    env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    outcome = evaluate_policy(env, weights, chosen.contexts, seeds, gamma=config.learner.gamma)
+    outcome = evaluate_policy(env, policy, chosen.contexts, seeds, gamma=config.learner.gamma)
     names = ("return", "discounted_return", "length", "success")
     columns = (outcome.returns, outcome.discounted_returns, outcome.lengths, outcome.success)
     means = {
