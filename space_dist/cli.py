@@ -81,10 +81,11 @@ def train(
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
     console.print(
-        f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}", highlight=False
-    )
+        f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}",
+        highlight=False, markup=False, soft_wrap=True,
+    )  # fmt: skip
     if outcome.tracking_warning:
-        errors.print(f"warning: {outcome.tracking_warning}", highlight=False)
+        errors.print(f"warning: {outcome.tracking_warning}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command()
@@ -220,7 +221,7 @@ def instances_sample(
         if path.exists():
             raise ConfigError(f"{path} exists; choose another --out, or remove it")
         _write(path, chosen.to_csv())
-        console.print(f"{path}: {len(chosen)} instances", highlight=False)
+        console.print(f"{path}: {len(chosen)} instances", highlight=False, markup=False, soft_wrap=True)
 
 
 @instances_app.command("check")

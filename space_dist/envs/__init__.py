@@ -43,7 +43,10 @@ def make_batched(
             inspect.signature(make).bind(n_slots, **kwargs)
         except TypeError as error:
             raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
-    env: BatchedEnv = make(n_slots, **kwargs)
+    try:
+        env: BatchedEnv = make(n_slots, **kwargs)
+    except (Exception, SystemExit) as error:  # somebody else's code may raise anything
+        raise ConfigError(f"env.id {env_id!r} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
                if not hasattr(env, name)]  # fmt: skip
     if missing:
@@ -62,8 +65,9 @@ def _find(env_id: str) -> Callable[[int], Any]:
         )
     try:
         found = getattr(importlib.import_module(module_name), name, None)
-    except (ImportError, SyntaxError, ValueError) as error:
-        raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {error}") from None
+    except (Exception, SystemExit) as error:  # somebody else's module may raise anything
+        what = f"{type(error).__name__}: {str(error)[:200]}"
+        raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {what}") from error
     if not callable(found):
         raise ConfigError(f"env.id {env_id!r}: {module_name!r} has no function {name!r}")
     made: Callable[[int], Any] = found
