@@ -23,7 +23,7 @@ from space_dist.errors import SpaceDistError
 from space_dist.instances import sample
 from space_dist.launch import private_ray
 from space_dist.rollout import Walk
-from space_dist.training import make_learner, make_setup
+from space_dist.training import learner_of, make_setup
 
 ROOT = Path(__file__).resolve().parent.parent
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -80,10 +80,10 @@ def curriculum(
 def _ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
     train, test = sample("pointmass_uniform", 100, 100, 0)
     setup = make_setup(config, train, test)
-    cluster, learner = InProcess(config, setup), make_learner(config)
-    weights = learner.weights(0)
+    cluster, learner = InProcess(config, setup), learner_of(config)
+    weights = learner.policy(0)
     decision = cluster.begin(cluster.start_values(weights))
-    shards = cluster.collect(weights, decision.selection, Walk(-1, ()), round=0, version=0)
+    shards = cluster.collect(weights, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
     return _median_cpu(lambda: learner.update(shards, round=0, steps=config.learner.n_steps), repeats)
 
 
@@ -91,14 +91,14 @@ def _curriculum_row(config: configs.RunConfig, n_instances: int, repeats: int) -
     train, test = sample("pointmass_uniform", n_instances, 1, 0)
     setup = make_setup(config, train, test)
     cluster, central = InProcess(config, setup), Central(config, train)
-    weights = make_learner(config).weights(0)
+    weights = learner_of(config).policy(0)
     chunks = cluster.start_values(weights)  # the first time, start observations are made and cached
     state, _, _, before = central.begin(*chunks)
     everything = dataclasses.replace(state, size=n_instances, selected=np.arange(n_instances))
     noise = np.random.default_rng(0).standard_normal(n_instances)
     changed = np.array_split(before + noise, len(chunks))
     revalue = _median_cpu(lambda: cluster.start_values(weights), repeats)
-    select = _median_cpu(lambda: central.decide(everything, before, 0, 1, *changed), repeats)
+    select = _median_cpu(lambda: central.decide(everything, before, 0, 1, len(changed), *changed), repeats)
     return {
         "instances": n_instances, "revalue": revalue, "select": select,
         "transport": max(0.0, _through_ray(config, setup, everything, before, repeats) - revalue - select),
@@ -110,7 +110,7 @@ def _through_ray(config: configs.RunConfig, setup: Any, state: Any, before: Any,
     from space_dist.distributed import RayCluster
 
     local = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 1})})
-    weights = make_learner(config).weights(0)
+    weights = learner_of(config).policy(0)
     with RayCluster(local, setup) as cluster:
         state_handle, before_handle = cluster.put(state), cluster.put(before)
 

@@ -81,10 +81,11 @@ def train(
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
     console.print(
-        f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}", highlight=False
-    )
+        f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}",
+        highlight=False, markup=False, soft_wrap=True,
+    )  # fmt: skip
     if outcome.tracking_warning:
-        errors.print(f"warning: {outcome.tracking_warning}", highlight=False)
+        errors.print(f"warning: {outcome.tracking_warning}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command()
@@ -101,22 +102,21 @@ def evaluate(
     import numpy as np
 
     from space_dist import config as configs
-    from space_dist.envs import make_batched
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of
     from space_dist.ledger import Ledger
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
+    from space_dist.training import make_env
 
     ledger = Ledger(run)
     status = ledger.status()
     config = configs.load(ledger.config)
-    weights = policy_of(ledger)
-    env_one = make_batched(config.env.id, 1, context_visible=False)
-    chosen = read_csv(instances, env_one.context_bounds)
-    env = make_batched(config.env.id, len(chosen), context_visible=config.env.context_visible)
+    policy = policy_of(ledger)
+    chosen = read_csv(instances, make_env(config).context_bounds)
+    env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    outcome = evaluate_policy(env, weights, chosen.contexts, seeds, gamma=config.learner.gamma)
+    outcome = evaluate_policy(env, policy, chosen.contexts, seeds, gamma=config.learner.gamma)
     names = ("return", "discounted_return", "length", "success")
     columns = (outcome.returns, outcome.discounted_returns, outcome.lengths, outcome.success)
     means = {
@@ -221,7 +221,7 @@ def instances_sample(
         if path.exists():
             raise ConfigError(f"{path} exists; choose another --out, or remove it")
         _write(path, chosen.to_csv())
-        console.print(f"{path}: {len(chosen)} instances", highlight=False)
+        console.print(f"{path}: {len(chosen)} instances", highlight=False, markup=False, soft_wrap=True)
 
 
 @instances_app.command("check")

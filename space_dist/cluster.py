@@ -37,22 +37,28 @@ class Cluster(Protocol):
     def put(self, value: object) -> Handle:
         """Make a value available to every worker."""
 
-    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
-        """One `Shard` per shard."""
+    def collect(
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+    ) -> list[Handle]:
+        """One `Shard` per shard, of a round that begins after `steps` environment steps."""
 
-    def start_values(self, weights: Handle) -> list[Handle]:
+    def start_values(self, policy: Handle) -> list[Handle]:
         """One array per chunk of the training instances."""
 
-    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
+    def evaluate(self, policy: Handle, split: Split) -> list[Handle]:
         """One `Outcomes` per part."""
 
     def begin(self, values: Sequence[Handle]) -> Decision:
         """The curriculum's first decision."""
 
     def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
-    ) -> Decision:
-        """The curriculum's next decision, on selection `version`."""
+        self, state: Handle, before: Handle, after: Sequence[Handle],
+        *, version: int, gradient_steps: int, rescored: Sequence[Handle] = (),
+    ) -> Decision:  # fmt: skip
+        """The curriculum's next decision, on selection `version`.
+
+        rescored: the values before, chunk by chunk, where scales have changed since and `before` is no longer true.
+        """
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values."""
@@ -72,12 +78,17 @@ class Central:
         return state, selection, {}, np.zeros_like(values) if self._from_zero else values
 
     def decide(
-        self, state: State, before: FloatArray, version: int, gradient_steps: int, *chunks: FloatArray
+        self, state: State, before: FloatArray, version: int, gradient_steps: int, n_after: int, *chunks: FloatArray
     ) -> tuple[State, Selection, dict[str, Any], FloatArray]:
-        """The next decision and V_t. Raises RuntimeError if `state` is not the one that made selection `version`."""
+        """The next decision and V_t: the first `n_after` chunks; further ones replace `before`.
+
+        Raises RuntimeError if `state` is not the one that made selection `version`.
+        """
         if state.version != version:
             raise RuntimeError(f"asked to go on from selection {version} with the state of {state.version}")
-        after = checked(np.concatenate(chunks), "start values")
+        after = checked(np.concatenate(chunks[:n_after]), "start values")
+        if len(chunks) > n_after:
+            before = checked(np.concatenate(chunks[n_after:]), "start values")
         new, selection, numbers = self._curriculum.step(state, Feedback(version, before, after, gradient_steps))
         return new, selection, numbers, after
 
@@ -92,30 +103,35 @@ class InProcess:
         """The value itself."""
         return value
 
-    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
+    def collect(
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+    ) -> list[Handle]:
         """See `Cluster`."""
+        asked = {"round": round, "steps": steps, "selection_version": version}
         return [
-            self._worker.collect(weights, selection, walk, round=round, shard=shard, selection_version=version)
-            for shard in range(self._setup.shards)
+            self._worker.collect(policy, selection, walk, shard=shard, **asked) for shard in range(self._setup.shards)
         ]
 
-    def start_values(self, weights: Handle) -> list[Handle]:
+    def start_values(self, policy: Handle) -> list[Handle]:
         """See `Cluster`."""
-        return [self._worker.start_values(weights, chunk) for chunk in range(self._setup.chunks)]
+        return [self._worker.start_values(policy, chunk) for chunk in range(self._setup.chunks)]
 
-    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
+    def evaluate(self, policy: Handle, split: Split) -> list[Handle]:
         """See `Cluster`."""
-        return [self._worker.evaluate(weights, split, part) for part in range(self._setup.evaluation_parts)]
+        return [self._worker.evaluate(policy, split, part) for part in range(self._setup.evaluation_parts)]
 
     def begin(self, values: Sequence[Handle]) -> Decision:
         """See `Cluster`."""
         return Decision(*self._central.begin(*values))
 
     def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
-    ) -> Decision:
+        self, state: Handle, before: Handle, after: Sequence[Handle],
+        *, version: int, gradient_steps: int, rescored: Sequence[Handle] = (),
+    ) -> Decision:  # fmt: skip
         """See `Cluster`."""
-        return Decision(*self._central.decide(state, before, version, gradient_steps, *after))
+        return Decision(
+            *self._central.decide(state, before, version, gradient_steps, len(after), *after, *rescored)
+        )  # fmt: skip
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """The values themselves."""
@@ -141,7 +157,8 @@ def _rank(
     config: RunConfig, settings: SpaceConfig | RandomGrowthConfig | ContextSpaceConfig, train: InstanceSet
 ) -> variants.Rank:
     if settings.kind == "cspace":
-        bounds = make_batched(config.env.id, 1, context_visible=False).context_bounds
+        env = config.env
+        bounds = make_batched(env.id, 1, context_visible=False, kwargs=env.kwargs).context_bounds
         by_distance = {"centroid": variants.near_centroid, "nearest_member": variants.near_member}
         return by_distance[settings.distance](bounds.scale(train.contexts))
     if settings.kind == "random_growth" or settings.pic == "random":

@@ -41,6 +41,8 @@ class EnvConfig(_Section):
     id: str = Field(min_length=1, max_length=300)
     """Registered id (space_dist/PointMass-v0) or import path of a function that makes a batched environment
     (my_package.my_module:make)."""
+    kwargs: dict[str, bool | int | float | str] = {}
+    """Arguments of the environment, by name. What they mean, and their units, is the environment's."""
     context_visible: bool = True
     """Whether observations end with the context, scaled from its bounds to [-1, 1]. The released SPaCE code hides it;
     value-based curricula need it where all episodes start alike."""
@@ -163,24 +165,44 @@ CurriculumConfig = Annotated[
 ]
 
 
-class _OnPolicy(_Section):
+class _Learner(_Section):
+    policy: str = Field(default="MlpPolicy", min_length=1, max_length=300)
+    """SB3's MlpPolicy (acts in NumPy, without torch), CnnPolicy (images), MultiInputPolicy (dictionaries), or the
+    import path of a policy class (my_package.my_module:MyPolicy)."""
+    learning_rate_schedule: Literal["constant", "linear"] = "constant"
+    """`linear` falls to 0 at the end of the budget."""
+    gamma: float = Field(default=0.95, ge=0.0, le=1.0)
+    """Discount per step. Source: the paper, appendix A (0.95)."""
+    net_arch: tuple[Annotated[int, Field(ge=1, le=16384)], ...] = Field(default=(64, 64), max_length=16, strict=False)
+    """Units of each hidden layer, for actor and critic each. Source: the paper, appendix A (two layers of 64)."""
+    normalize_observations: bool = False
+    """Scale observations to mean 0 and standard deviation 1, as of the rounds before; one round of actions that ignore
+    the observation, charged to the budget, gives the first scales."""
+    normalize_rewards: bool = False
+    """Divide rewards by the standard deviation of the discounted return, as of the rounds before. Start values are
+    reported in unscaled reward units."""
+
+    @field_validator("policy")
+    @classmethod
+    def _known_policy(cls, value: str) -> str:
+        known = ("MlpPolicy", "CnnPolicy", "MultiInputPolicy")
+        if value not in known and ":" not in value:
+            raise ValueError(
+                f"not known{nearest(value, known)} Allowed: {', '.join(known)}, or an import path with a colon"
+            )
+        return value
+
+
+class _OnPolicy(_Learner):
     n_steps: int = Field(default=2048, ge=2)
     """Environment transitions per update, over all shards and slots; the same constant for every curriculum. Source:
     SB3's PPO (2048); sb3-contrib's TRPO and the released SPaCE code on PointMass differ (2048 and 1024)."""
     learning_rate: float = Field(default=3e-4, gt=0.0)
     """Step size of Adam. Source: SB3's PPO (3e-4); for TRPO it is the critic's, sb3-contrib has 1e-3."""
-    learning_rate_schedule: Literal["constant", "linear"] = "constant"
-    """`linear` falls to 0 at the end of the budget."""
-    batch_size: int = Field(default=64, ge=2)
-    """Transitions per minibatch. Source: SB3's PPO (64); sb3-contrib's TRPO has 128."""
-    gamma: float = Field(default=0.95, ge=0.0, le=1.0)
-    """Discount per step. Source: the paper, appendix A (0.95)."""
     gae_lambda: float = Field(default=0.99, ge=0.0, le=1.0)
     """Lambda of generalised advantage estimation. Source: the paper, appendix A (0.99)."""
     normalize_advantage: bool = True
-    """Scale advantages to mean 0 and standard deviation 1 per minibatch. Source: SB3."""
-    net_arch: tuple[Annotated[int, Field(ge=1, le=16384)], ...] = Field(default=(64, 64), max_length=16, strict=False)
-    """Units of each hidden layer, for actor and critic each. Source: the paper, appendix A (two layers of 64)."""
+    """Scale advantages to mean 0 and standard deviation 1 per minibatch. Source: SB3's PPO; its A2C does not."""
     activation: Literal["tanh", "relu"] = "tanh"
     """Activation of the hidden layers. Source: SB3."""
     log_std_init: float = 0.0
@@ -192,6 +214,8 @@ class PPOConfig(_OnPolicy):
 
     kind: Literal["ppo"]
     """Which learner: PPO."""
+    batch_size: int = Field(default=64, ge=2)
+    """Transitions per minibatch. Source: SB3 (64)."""
     n_epochs: int = Field(default=10, ge=1)
     """Passes over each update's transitions. Source: SB3 (10); the paper's PPO2 default is 4."""
     clip_range: float = Field(default=0.2, gt=0.0)
@@ -229,7 +253,118 @@ class TRPOConfig(_OnPolicy):
     """Shortened steps tried before an update is given up. Source: sb3-contrib."""
 
 
-LearnerConfig = Annotated[PPOConfig | TRPOConfig, Field(discriminator="kind")]
+class A2CConfig(_OnPolicy):
+    """Stable-Baselines3 A2C: one gradient step on all of an update's transitions."""
+
+    kind: Literal["a2c"]
+    """Which learner: A2C."""
+    learning_rate: float = Field(default=7e-4, gt=0.0)
+    """Step size. Source: SB3."""
+    normalize_advantage: bool = False
+    """Scale advantages to mean 0 and standard deviation 1. Source: SB3."""
+    ent_coef: float = Field(default=0.0, ge=0.0)
+    """Weight of the entropy bonus. Source: SB3."""
+    vf_coef: float = Field(default=0.5, ge=0.0)
+    """Weight of the value loss. Source: SB3."""
+    max_grad_norm: float | None = Field(default=0.5, gt=0.0)
+    """Largest norm of the gradient; null: no clipping. Source: SB3."""
+    use_rms_prop: bool = True
+    """RMSProp as in TensorFlow, instead of Adam. Source: SB3."""
+    rms_prop_eps: float = Field(default=1e-5, gt=0.0)
+    """Epsilon of RMSProp. Source: SB3."""
+
+
+class _OffPolicy(_Learner):
+    n_steps: int = Field(default=512, ge=1)
+    """Environment transitions per round, over all shards and slots, collected with the policy of the round before:
+    SB3's train_freq. Every slot starts from a fresh reset, so a slot must be as long as the horizon."""
+    n_episodes: int | None = Field(default=None, ge=1)
+    """End a round with this many episodes instead; rollout.shards and rollout.slots must be 1. null: by n_steps."""
+    gamma: float = Field(default=0.99, ge=0.0, le=1.0)
+    """Discount per step. Source: SB3."""
+    activation: Literal["tanh", "relu"] = "relu"
+    """Activation of the hidden layers. Source: SB3."""
+    batch_size: int = Field(default=256, ge=1)
+    """Transitions per gradient step. Source: SB3's SAC and TD3 (256); its DQN has 32."""
+    buffer_size: int = Field(default=100_000, ge=1, le=10**8)
+    """Transitions that the replay buffer remembers. Source: ours (SB3: 1e6)."""
+    learning_starts: int = Field(default=100, ge=0)
+    """Environment steps of uniformly random actions, and before the first gradient step. Source: SB3 (100)."""
+    gradient_steps_per_step: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Gradient steps per environment step. Source: SB3's SAC and TD3 (1); its DQN makes 1 every 4 steps (0.25)."""
+    tau: float = Field(default=0.005, gt=0.0, le=1.0)
+    """Share of the online network that enters the target network per update. Source: SB3's SAC and TD3."""
+
+
+class DQNConfig(_OffPolicy):
+    """Stable-Baselines3 DQN (Huber loss, linear epsilon)."""
+
+    kind: Literal["dqn"]
+    """Which learner: DQN."""
+    learning_rate: float = Field(default=1e-4, gt=0.0)
+    """Step size of Adam. Source: SB3."""
+    batch_size: int = Field(default=32, ge=1)
+    """Transitions per gradient step. Source: SB3."""
+    gradient_steps_per_step: float = Field(default=0.25, gt=0.0, le=100.0)
+    """Gradient steps per environment step. Source: SB3 (one every 4 steps)."""
+    tau: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Share of the online network that enters the target network per update. Source: SB3 (1: a copy)."""
+    target_update_interval: int = Field(default=10_000, ge=1)
+    """Environment steps between updates of the target network. Source: SB3."""
+    exploration_fraction: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Share of the run over which epsilon falls. Source: SB3."""
+    exploration_initial_eps: float = Field(default=1.0, ge=0.0, le=1.0)
+    """Probability of a random action at the start. Source: SB3."""
+    exploration_final_eps: float = Field(default=0.05, ge=0.0, le=1.0)
+    """Probability of a random action in the end. Source: SB3."""
+    max_grad_norm: float | None = Field(default=10.0, gt=0.0)
+    """Largest norm of the gradient; null: no clipping. Source: SB3."""
+
+
+class SACConfig(_OffPolicy):
+    """Stable-Baselines3 SAC. Its start values contain the entropy bonus."""
+
+    kind: Literal["sac"]
+    """Which learner: SAC."""
+    learning_rate: float = Field(default=3e-4, gt=0.0)
+    """Step size of Adam, for actor, critic and entropy coefficient. Source: SB3."""
+    net_arch: tuple[Annotated[int, Field(ge=1, le=16384)], ...] = Field(default=(256, 256), max_length=16, strict=False)
+    """Units of each hidden layer, for actor and critics each. Source: SB3."""
+    ent_coef: Literal["auto"] | float = "auto"
+    """Entropy coefficient alpha; auto: learned. Source: SB3."""
+    target_update_interval: int = Field(default=1, ge=1)
+    """Gradient steps between updates of the target network. Source: SB3."""
+    @field_validator("ent_coef")
+    @classmethod
+    def _not_negative(cls, value: str | float) -> str | float:
+        if not isinstance(value, str) and value < 0.0:
+            raise ValueError("must be at least 0, or auto")
+        return value
+
+
+class TD3Config(_OffPolicy):
+    """Stable-Baselines3 TD3."""
+
+    kind: Literal["td3"]
+    """Which learner: TD3."""
+    learning_rate: float = Field(default=1e-3, gt=0.0)
+    """Step size of Adam. Source: SB3."""
+    net_arch: tuple[Annotated[int, Field(ge=1, le=16384)], ...] = Field(default=(400, 300), max_length=16, strict=False)
+    """Units of each hidden layer, for actor and critics each. Source: SB3."""
+    action_noise_std: float = Field(default=0.1, ge=0.0)
+    """Standard deviation of the noise on executed actions, scaled to [-1, 1]. Source: Fujimoto et al. 2018 (0.1); SB3
+    has none."""
+    policy_delay: int = Field(default=2, ge=1)
+    """Critic updates per actor update. Source: SB3."""
+    target_policy_noise: float = Field(default=0.2, ge=0.0)
+    """Standard deviation of the noise on target actions. Source: SB3."""
+    target_noise_clip: float = Field(default=0.5, ge=0.0)
+    """Limit of that noise. Source: SB3."""
+
+
+LearnerConfig = Annotated[
+    PPOConfig | TRPOConfig | A2CConfig | DQNConfig | SACConfig | TD3Config, Field(discriminator="kind")
+]
 
 
 class RolloutConfig(_Section):
@@ -252,6 +387,8 @@ class BudgetConfig(_Section):
 
     steps: int = Field(ge=1, le=10**12)
     """Real environment steps of training, warm-up and probes included. A run makes as many whole updates as fit."""
+    episodes: int | None = Field(default=None, ge=1)
+    """Training episodes after which the run ends if its steps have not; null: no such limit."""
 
 
 class EvaluationConfig(_Section):
@@ -330,6 +467,13 @@ class RunConfig(_Section):
     @model_validator(mode="after")
     def _whole_slots(self) -> Self:
         per_step = self.rollout.shards * self.rollout.slots
+        if self.n_episodes is not None:
+            if per_step != 1:
+                raise ValueError(
+                    "learner.n_episodes ends rounds by episodes, which takes rollout.shards = 1 and rollout.slots = 1, "
+                    f"not {self.rollout.shards} and {self.rollout.slots}"
+                )
+            return self
         if self.learner.n_steps % per_step:
             raise ValueError(
                 f"learner.n_steps = {self.learner.n_steps} is not a multiple of rollout.shards * rollout.slots = "
@@ -343,14 +487,19 @@ class RunConfig(_Section):
         return self
 
     @property
-    def slot_length(self) -> int:
-        """Transitions per slot and round."""
+    def n_episodes(self) -> int | None:
+        """Episodes per round, where rounds end by episodes."""
+        return None if isinstance(self.learner, _OnPolicy) else self.learner.n_episodes
+
+    def slot_length(self, horizon: int) -> int:
+        """Transitions per slot and round; the most there can be, where rounds end by episodes."""
+        if self.n_episodes is not None:
+            return self.n_episodes * horizon
         return self.learner.n_steps // (self.rollout.shards * self.rollout.slots)
 
-    @property
-    def rounds(self) -> int:
-        """Updates in the whole run."""
-        return self.budget.steps // self.learner.n_steps
+    def round_steps(self, horizon: int) -> int:
+        """Environment steps of a round; the most there can be, where rounds end by episodes."""
+        return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots
 
 
 NOT_IDENTITY = ("checkpoint", "tracking", "resources")  # sections that cannot change a result

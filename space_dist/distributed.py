@@ -127,30 +127,34 @@ class RayCluster:
         """See `cluster.Cluster`."""
         return _Piece(ray.put(value))
 
-    def collect(self, weights: Handle, selection: Handle, walk: Walk, *, round: int, version: int) -> list[Handle]:
+    def collect(
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+    ) -> list[Handle]:
         """See `cluster.Cluster`."""
-        asked = {"round": round, "selection_version": version}
+        asked = {"round": round, "steps": steps, "selection_version": version}
         shards = range(self._setup.shards)
-        return [self._ask(shard, "collect", weights, selection, walk, shard=shard, **asked)[0] for shard in shards]
+        return [self._ask(shard, "collect", policy, selection, walk, shard=shard, **asked)[0] for shard in shards]
 
-    def start_values(self, weights: Handle) -> list[Handle]:
+    def start_values(self, policy: Handle) -> list[Handle]:
         """See `cluster.Cluster`."""
-        return [self._ask(chunk, "start_values", weights, chunk)[0] for chunk in range(self._setup.chunks)]
+        return [self._ask(chunk, "start_values", policy, chunk)[0] for chunk in range(self._setup.chunks)]
 
-    def evaluate(self, weights: Handle, split: Split) -> list[Handle]:
+    def evaluate(self, policy: Handle, split: Split) -> list[Handle]:
         """See `cluster.Cluster`."""
         parts = range(self._setup.evaluation_parts)
-        return [self._ask(part, "evaluate", weights, split, part)[0] for part in parts]
+        return [self._ask(part, "evaluate", policy, split, part)[0] for part in parts]
 
     def begin(self, values: Sequence[Handle]) -> Decision:
         """See `cluster.Cluster`."""
         return Decision(*self._ask(_CENTRAL, "begin", *values))
 
     def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle], *, version: int, gradient_steps: int
-    ) -> Decision:
+        self, state: Handle, before: Handle, after: Sequence[Handle],
+        *, version: int, gradient_steps: int, rescored: Sequence[Handle] = (),
+    ) -> Decision:  # fmt: skip
         """See `cluster.Cluster`."""
-        return Decision(*self._ask(_CENTRAL, "decide", state, before, version, gradient_steps, *after))
+        asked = (state, before, version, gradient_steps, len(after), *after, *rescored)
+        return Decision(*self._ask(_CENTRAL, "decide", *asked))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""

@@ -24,13 +24,13 @@ from threadpoolctl import threadpool_limits
 from space_dist import config as configs
 from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
-from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
-from space_dist.rollout import MlpWeights, Setup, from_arrays
-from space_dist.training import Progress, Training, make_setup, policy_in
+from space_dist.policy import Policy, from_arrays
+from space_dist.rollout import Setup
+from space_dist.training import Progress, Training, make_env, make_setup, policy_in
 
 log = logging.getLogger("space_dist")
 
@@ -54,7 +54,7 @@ def default_folder(config: RunConfig) -> Path:
 
 def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
     """The training and test instances of a config. Raises ConfigError for a bad file, or one that shares a context."""
-    bounds = make_batched(config.env.id, 1, context_visible=False).context_bounds
+    bounds = make_env(config).context_bounds
     train, test = read_csv(config.instances.train, bounds), read_csv(config.instances.test, bounds)
     refuse_overlap(train, test, str(config.instances.train), str(config.instances.test))
     return train, test
@@ -92,7 +92,7 @@ def launch(
                     "resumed on another CPU model or with other library versions: results are valid, but no longer "
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
-            log.info("seed %d, %d updates of %d steps", config.seed, config.rounds, config.learner.n_steps)
+            log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
             with _cluster(config, setup, stop) as cluster:
                 Training(
                     config, setup, cluster, writer, status=status, stop_requested=stop.reason, observe=observe
@@ -169,12 +169,14 @@ def absolute_uri(uri: str | None) -> str | None:
     return f"{prefix}{Path(uri.removeprefix(prefix)).absolute()}" if uri and uri.startswith(prefix) else uri
 
 
-def policy_of(ledger: Ledger) -> MlpWeights:
+def policy_of(ledger: Ledger) -> Policy:
     """The policy of a finished run, or that of an unfinished one's last checkpoint. Raises LedgerError without any."""
     if ledger.model_arrays.exists() and ledger.model_description.exists():
         try:
-            with np.load(ledger.model_arrays, allow_pickle=False) as file:
-                return from_arrays(dict(file), json.loads(ledger.model_description.read_bytes()))
+            description = json.loads(ledger.model_description.read_bytes())
+            if description["policy"] != "torch":  # those come from the last checkpoint, below
+                with np.load(ledger.model_arrays, allow_pickle=False) as file:
+                    return from_arrays(dict(file), description)
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError):
             raise LedgerError(f"the model in {ledger.folder} is damaged (model.npz, model.json)") from None
     for file in ledger.checkpoint_files():

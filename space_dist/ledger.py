@@ -6,6 +6,7 @@
     curriculum.jsonl      one row per iteration: which instances were trained on
     timing.jsonl          one row per row of metrics.jsonl: when, and how long it took
     checkpoints/*.npz     the last two; arrays and JSON, never a pickle
+    replay/*.npz          what replay buffers hold, in pieces that are written once and named by the checkpoints
     model.npz, model.json the trained policy, once the run is done
     log.txt               what the run said
 
@@ -80,6 +81,21 @@ class Checkpoint:
     round: int
     arrays: Mapping[str, NDArray[Any]]
     data: Mapping[str, Any]
+    segments: tuple[Segment, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Segment:
+    """A piece of a replay buffer: `count` transitions from the run's transition number `first` on, in a file."""
+
+    first: int
+    count: int
+    sha256: str
+
+    @property
+    def name(self) -> str:
+        """The file's; what it names never changes."""
+        return f"{self.first:012d}-{self.first + self.count:012d}.npz"
 
 
 def atomic_write(path: Path, content: bytes) -> None:
@@ -127,6 +143,7 @@ class Ledger:
         self.config = self.folder / "config.yaml"
         self.status_file = self.folder / "status.json"
         self.checkpoints = self.folder / "checkpoints"
+        self.replay = self.folder / "replay"
         self.log = self.folder / "log.txt"
         self.stop_file = self.folder / "stop"
         self.lock_file = self.folder / "lock.json"
@@ -217,7 +234,8 @@ def find_ledgers(paths: list[Path]) -> list[Ledger]:
 
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """An uncompressed npz; its `meta` names a SHA-256 over every array and all data."""
-    meta = {"round": checkpoint.round, "data": dict(checkpoint.data), "format": FORMAT}
+    segments = [[segment.first, segment.count, segment.sha256] for segment in checkpoint.segments]
+    meta = {"round": checkpoint.round, "data": dict(checkpoint.data), "segments": segments, "format": FORMAT}
     meta["sha256"] = _digest(meta, checkpoint.arrays)
     buffer = io.BytesIO()
     encoded = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
@@ -240,7 +258,8 @@ def decode_checkpoint(content: bytes) -> Checkpoint:
         written = meta.pop("sha256")
         if meta["format"] != FORMAT or written != _digest(meta, arrays):
             raise ValueError("checksum")
-        return Checkpoint(round=int(meta["round"]), arrays=arrays, data=dict(meta["data"]))
+        segments = tuple(Segment(int(first), int(count), str(sha)) for first, count, sha in meta["segments"])
+        return Checkpoint(round=int(meta["round"]), arrays=arrays, data=dict(meta["data"]), segments=segments)
     except (zipfile.BadZipFile, KeyError, TypeError, AttributeError, OSError, EOFError, RecursionError,
             NotImplementedError, RuntimeError, MemoryError, zlib.error) as error:  # fmt: skip
         raise ValueError(str(error)) from None
@@ -318,6 +337,9 @@ class RunWriter:
         return None
 
     def _verified_prefixes(self, checkpoint: Checkpoint) -> dict[str, bytes]:
+        for segment in checkpoint.segments:
+            if hashlib.sha256(self._segment_path(segment).read_bytes()).hexdigest() != segment.sha256:
+                raise ValueError(f"{segment.name} has changed since")
         prefixes = {}
         for name, (size, sha256) in checkpoint.data["files"].items():
             if name not in ROW_FILES:
@@ -368,6 +390,32 @@ class RunWriter:
             )
             for old in self.ledger.checkpoint_files()[KEPT_CHECKPOINTS:]:
                 old.unlink()
+
+    def write_segment(self, first: int, count: int, arrays: Mapping[str, NDArray[Any]]) -> Segment:
+        """Store a piece of a replay buffer; it counts once a checkpoint names it."""
+        buffer = io.BytesIO()
+        _savez(buffer, arrays)
+        content = buffer.getvalue()
+        segment = Segment(first, count, hashlib.sha256(content).hexdigest())
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            self.ledger.replay.mkdir(exist_ok=True)
+            atomic_write(self._segment_path(segment), content)
+        return segment
+
+    def read_segment(self, segment: Segment) -> dict[str, NDArray[Any]]:
+        """The arrays of a piece whose checksum `restore` has verified."""
+        with np.load(self._segment_path(segment), allow_pickle=False) as file:
+            return dict(file)
+
+    def drop_segments(self, kept: set[str]) -> None:
+        """Remove the pieces that no checkpoint names any more."""
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            for path in self.ledger.replay.glob("*.npz"):
+                if path.name not in kept:
+                    path.unlink()
+
+    def _segment_path(self, segment: Segment) -> Path:
+        return self.ledger.replay / segment.name
 
     def set_status(self, status: Status) -> None:
         """Write a new status that keeps what the last commit said about files."""

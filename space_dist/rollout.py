@@ -1,122 +1,34 @@
-"""Collecting episodes, evaluating policies and scoring instances: pure functions of (weights, selection, seed).
+"""Collecting episodes, evaluating policies and scoring instances: pure functions of (policy, selection, seed).
 
-Policies are evaluated here in NumPy, so a rollout actor imports neither torch nor Stable-Baselines3. The number of
-shards, the slots of a shard and the size of every chunk are fixed by the config: whoever computes a piece of work, and
-how often, it gives the same bits.
+A rollout actor imports neither torch nor Stable-Baselines3, unless the policy it is sent does. The number of shards,
+the slots of a shard and the size of every chunk are fixed by the config: whoever computes a piece of work, and how
+often, it gives the same bits.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.curricula import Selection
-from space_dist.envs import BatchedEnv, make_batched
+from space_dist.envs import BatchedEnv, Observations, make_batched
+from space_dist.envs.observations import allocate, concatenate, put, rows, take
 from space_dist.instances import InstanceSet
+from space_dist.policy import Noise, Policy
 from space_dist.seeding import Purpose, episode_seeds, generator
 
-Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Layers = tuple[tuple[Array, Array], ...]
 Split = Literal["train", "test"]
 
 CHUNK = 65_536  # start observations scored by one call
 BLOCK = 2_048  # rows of one matrix product: what fits the cache. Both are part of every result
 TERMINATED, TRUNCATED, CUT = 0, 1, 2
-
-
-@dataclass(frozen=True)
-class MlpWeights:
-    """An actor-critic of two multilayer perceptrons, as NumPy sees it.
-
-    version: how many updates made these weights.
-    actor, critic: layers of (weights (n_in, n_out), biases (n_out,)).
-    log_std: (action_dim,) of a Gaussian policy; None for a categorical one.
-    """
-
-    version: int
-    activation: Literal["tanh", "relu"]
-    actor: Layers
-    critic: Layers
-    log_std: Array | None
-
-
-def to_arrays(weights: MlpWeights) -> tuple[dict[str, Array], dict[str, Any]]:
-    """A policy as arrays and a description, for `model.npz` and `model.json`: usable without this package."""
-    arrays: dict[str, Array] = {}
-    for part in ("actor", "critic"):
-        for index, (matrix, bias) in enumerate(getattr(weights, part)):
-            arrays |= {f"{part}.{index}.weight": matrix, f"{part}.{index}.bias": bias}
-    if weights.log_std is not None:
-        arrays["log_std"] = weights.log_std
-    return arrays, {
-        "format": 1,
-        "version": weights.version,
-        "activation": weights.activation,
-        "policy": "categorical" if weights.log_std is None else "gaussian",
-        "formula": "x = activation(x @ weight + bias) per layer; the last layer is linear",
-        "shapes": {name: list(array.shape) for name, array in arrays.items()},
-    }
-
-
-def from_arrays(arrays: Mapping[str, Array], description: Mapping[str, Any]) -> MlpWeights:
-    """The inverse of `to_arrays`. Raises KeyError or ValueError for anything else."""
-    if description["format"] != 1 or description["activation"] not in ("tanh", "relu"):
-        raise ValueError("not a model description of format 1")
-
-    def layers(part: str) -> Layers:
-        count = sum(name.startswith(f"{part}.") for name in arrays) // 2
-        return tuple((arrays[f"{part}.{index}.weight"], arrays[f"{part}.{index}.bias"]) for index in range(count))
-
-    log_std = arrays["log_std"] if description["policy"] == "gaussian" else None
-    activation: Literal["tanh", "relu"] = description["activation"]
-    return MlpWeights(int(description["version"]), activation, layers("actor"), layers("critic"), log_std)
-
-
-def forward(layers: Layers, activation: str, inputs: Array) -> Array:
-    """`(n, n_in) -> (n, n_out)`; the last layer is linear."""
-    for weights, biases in layers[:-1]:
-        inputs = inputs @ weights
-        inputs += biases
-        if activation == "tanh":
-            np.tanh(inputs, out=inputs)
-        else:
-            np.maximum(inputs, 0.0, out=inputs)
-    weights, biases = layers[-1]
-    return inputs @ weights + biases
-
-
-def values(weights: MlpWeights, observations: Array) -> Array:
-    """`(n, obs_dim) -> (n,)` V(s) of the critic."""
-    return forward(weights.critic, weights.activation, observations)[:, 0]
-
-
-def act(weights: MlpWeights, observations: Array, noise: Array | None) -> NDArray[np.generic]:
-    """Actions for `(n, obs_dim)` observations: sampled with `noise`, the most likely ones without.
-
-    noise: (n, action_dim), standard normal for Gaussian policies and Gumbel for categorical ones.
-    """
-    outputs = forward(weights.actor, weights.activation, observations)
-    actions: NDArray[np.generic] = outputs
-    if weights.log_std is None:
-        actions = np.argmax(outputs if noise is None else outputs + noise, axis=1)
-    elif noise is not None:
-        actions = outputs + np.exp(weights.log_std) * noise
-    return actions
-
-
-def executed(action_space: spaces.Space[NDArray[np.generic]], actions: NDArray[np.generic]) -> NDArray[np.generic]:
-    """What the environment is given: Gaussian actions are clipped to the action space, as SB3 does."""
-    if isinstance(action_space, spaces.Box):
-        return np.clip(actions.astype(np.float32, copy=False), action_space.low, action_space.high)
-    return actions
 
 
 @dataclass(frozen=True)
@@ -145,26 +57,33 @@ class Episodes:
 class Shard:
     """What one shard collected in one round; time runs along axis 0, slots along axis 1.
 
-    observations (length, slots, obs_dim), actions (length, slots, ...) as sampled, rewards (length, slots),
+    observations (length, slots, ...), actions (length, slots, ...) as a buffer stores them, rewards (length, slots),
     terminated, truncated (length, slots).
-    last_observations: (slots, obs_dim) behind the last step, from which cut episodes are bootstrapped.
-    truncated_observations: (k, obs_dim) the last observation of each truncated episode, in the order of
+    last_observations: (slots, ...) behind the last step, from which cut episodes are bootstrapped.
+    truncated_observations: (k, ...) the last observation of each truncated episode, in the order of
         `np.argwhere(truncated)`.
+    next_observations: (length, slots, ...) behind every step, if asked for: replay buffers need them.
     """
 
     shard: int
     round: int
-    weights_version: int
+    policy_version: int
     selection_version: int
     order_version: int
-    observations: Array
+    observations: Observations
     actions: NDArray[np.generic]
     rewards: FloatArray
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
-    last_observations: Array
-    truncated_observations: Array
+    last_observations: Observations
+    truncated_observations: Observations
+    next_observations: Observations | None
     episodes: Episodes
+
+    @property
+    def steps(self) -> int:
+        """Environment steps."""
+        return int(self.rewards.size)
 
 
 @dataclass(frozen=True)
@@ -174,7 +93,7 @@ class Outcomes:
     returns, discounted_returns (n,) in reward units; lengths (n,) in steps; success (n,) as in `Episodes`.
     """
 
-    weights_version: int
+    policy_version: int
     returns: FloatArray
     discounted_returns: FloatArray
     lengths: IntArray
@@ -213,6 +132,13 @@ class Setup:
     evaluation_episodes: int
     train: InstanceSet
     test: InstanceSet
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    episodes_per_round: int | None = None  # a round ends with this many episodes instead of with its slots' length
+    keep_next_observations: bool = False
+
+    def make_env(self, n_slots: int) -> BatchedEnv:
+        """An environment of the run, as its policy sees it."""
+        return make_batched(self.env_id, n_slots, context_visible=self.context_visible, kwargs=self.env_kwargs)
 
     def instances(self, split: Split) -> InstanceSet:
         """The instance set of a split."""
@@ -239,40 +165,42 @@ class Worker:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self._collecting = self._make(setup.slots)
+        self._collecting = setup.make_env(setup.slots)
         self._evaluating: dict[int, BatchedEnv] = {}
-        self._starts: dict[int, Array] = {}
-
-    def _make(self, n_slots: int) -> BatchedEnv:
-        return make_batched(self._setup.env_id, n_slots, context_visible=self._setup.context_visible)
+        self._starts: dict[int, Observations] = {}
 
     def collect(
-        self, weights: MlpWeights, selection: Selection, walk: Walk, *, round: int, shard: int, selection_version: int
-    ) -> Shard:
-        """One shard of one round. Raises RuntimeError if weights or selection are not the ones asked for."""
-        if selection.version != selection_version or weights.version != round:
+        self, policy: Policy, selection: Selection, walk: Walk,
+        *, round: int, steps: int, shard: int, selection_version: int,
+    ) -> Shard:  # fmt: skip
+        """One shard of one round, which begins after `steps` environment steps.
+
+        Raises RuntimeError if policy or selection are not the ones asked for.
+        """
+        if selection.version != selection_version or policy.version != round:
             raise RuntimeError(
-                f"round {round} asked for selection {selection_version} and weights {round}, "
-                f"and got selection {selection.version} and weights {weights.version}"
+                f"round {round} asked for selection {selection_version} and policy {round}, "
+                f"and got selection {selection.version} and policy {policy.version}"
             )
         setup = self._setup
         return collect(
-            self._collecting, weights, selection,
-            start=walk.position(selection, shard, setup.shards),
-            length=setup.slot_length, gamma=setup.gamma, seed=setup.seed, round=round, shard=shard,
+            self._collecting, policy, selection,
+            start=walk.position(selection, shard, setup.shards), length=setup.slot_length, gamma=setup.gamma,
+            seed=setup.seed, round=round, shard=shard, steps=steps + shard * setup.slots * setup.slot_length,
+            episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
         )  # fmt: skip
 
-    def start_values(self, weights: MlpWeights, chunk: int) -> FloatArray:
+    def start_values(self, policy: Policy, chunk: int) -> FloatArray:
         """`(chunk_size,)` V(s0, c_i) of one chunk of the training instances: means over their start observations."""
         if chunk not in self._starts:
             self._starts[chunk] = start_observations(self._setup, chunk)
         observations = self._starts[chunk]
-        blocks = [values(weights, observations[row : row + BLOCK]) for row in range(0, len(observations), BLOCK)]
-        scores = np.concatenate(blocks).astype(np.float64)
-        means: FloatArray = scores.reshape(-1, self._setup.start_states).mean(axis=1)
+        starts = range(0, rows(observations), BLOCK)
+        blocks = [policy.values(take(observations, slice(row, row + BLOCK))) for row in starts]
+        means: FloatArray = np.concatenate(blocks).reshape(-1, self._setup.start_states).mean(axis=1)
         return means
 
-    def evaluate(self, weights: MlpWeights, split: Split, part: int) -> Outcomes:
+    def evaluate(self, policy: Policy, split: Split, part: int) -> Outcomes:
         """Deterministic episodes on one part of a split."""
         setup, instances = self._setup, self._setup.instances(split)
         episodes = setup.evaluation_episodes
@@ -283,72 +211,82 @@ class Worker:
         mine = np.array_split(np.arange(len(seeds)), setup.evaluation_parts)[part]
         if not len(mine):
             nothing = np.zeros(0)
-            return Outcomes(weights.version, nothing, nothing, nothing.astype(np.int64), nothing)
+            return Outcomes(policy.version, nothing, nothing, nothing.astype(np.int64), nothing)
         if len(mine) not in self._evaluating:
-            self._evaluating[len(mine)] = self._make(len(mine))
-        return evaluate(self._evaluating[len(mine)], weights, contexts[mine], seeds[mine], gamma=setup.gamma)
+            self._evaluating[len(mine)] = setup.make_env(len(mine))
+        return evaluate(self._evaluating[len(mine)], policy, contexts[mine], seeds[mine], gamma=setup.gamma)
 
 
 def collect(
-    env: BatchedEnv, weights: MlpWeights, selection: Selection,
-    *, start: int, length: int, gamma: float, seed: int, round: int, shard: int,
+    env: BatchedEnv, policy: Policy, selection: Selection,
+    *, start: int, length: int, gamma: float, seed: int, round: int, shard: int, steps: int = 0,
+    episodes: int | None = None, keep_next_observations: bool = False,
 ) -> Shard:  # fmt: skip
     """Collect exactly `length * env.n_slots` transitions, all from fresh resets, walking `selection` from `start`.
 
     Slots that end their episode at the same step take the next instances in slot order. The last episode of a slot is
-    cut where the round ends.
+    cut where the round ends. With `episodes`, which takes a single slot, the round ends when that many have.
+    steps: environment steps of the run before this shard's first, in the order of a replay buffer (time, then slots).
     """
     n = env.n_slots
     seeds = episode_seeds(seed, Purpose.EPISODES, round, shard, count=n * length)
-    noise = _action_noise(env.action_space, generator(seed, Purpose.ACTIONS, round, shard), (length, n))
-    observations = np.empty((length, n, *env.observation_space.shape), dtype=np.float32)
+    noise = Noise.draw(policy.head, env.action_space, generator(seed, Purpose.ACTIONS, round, shard), (length, n))
+    observations = allocate(env.observation_space, length, n)
+    following = allocate(env.observation_space, length, n) if keep_next_observations else None
     rewards = np.empty((length, n))
     terminated = np.zeros((length, n), dtype=np.bool_)
     truncated = np.zeros((length, n), dtype=np.bool_)
     actions: list[NDArray[np.generic]] = []
-    last: list[Array] = []
+    last: list[Observations] = []
     table = _EpisodeTable(n, gamma)
 
-    current = np.empty((n, *env.observation_space.shape), dtype=np.float32)
+    current = allocate(env.observation_space, n)
     ended = np.arange(n)
     for time in range(length):
         if len(ended):
+            if episodes is not None and len(table) == episodes:
+                length = time
+                break
             first = len(table)
             places = (start + first + np.arange(len(ended))) % len(selection.ids)
-            current[ended] = env.reset(ended, selection.contexts[places], seeds[first : first + len(ended)])
+            put(current, ended, env.reset(ended, selection.contexts[places], seeds[first : first + len(ended)]))
             table.begin(ended, selection.ids[places], time)
-        sampled = act(weights, current, noise[time])
-        step = env.step(executed(env.action_space, sampled))
-        observations[time], rewards[time] = current, step.rewards
+        stored = policy.head.sampled(policy.outputs(current), noise, time, steps + time * n + np.arange(n))
+        step = env.step(policy.head.executed(stored))
+        put(observations, time, current)
+        rewards[time] = step.rewards
         terminated[time], truncated[time] = step.terminated, step.truncated & ~step.terminated
-        actions.append(sampled)
+        actions.append(stored)
         table.add(step.rewards, step.success)
-        last.append(step.observations[truncated[time]])
+        last.append(take(step.observations, truncated[time]))
+        if following is not None:
+            put(following, time, step.observations)
         ended = np.flatnonzero(terminated[time] | truncated[time])
         table.end(ended, np.where(terminated[time], TERMINATED, TRUNCATED)[ended])
-        current = step.observations.copy()
+        put(current, slice(None), step.observations)
     table.end(table.running(), np.full(len(table.running()), CUT))
     return Shard(
-        shard=shard, round=round, weights_version=weights.version,
+        shard=shard, round=round, policy_version=policy.version,
         selection_version=selection.version, order_version=selection.order_version,
-        observations=observations, actions=np.stack(actions), rewards=rewards,
-        terminated=terminated, truncated=truncated,
-        last_observations=current, truncated_observations=np.concatenate(last), episodes=table.episodes(),
+        observations=take(observations, slice(length)), actions=np.stack(actions), rewards=rewards[:length],
+        terminated=terminated[:length], truncated=truncated[:length],
+        last_observations=current, truncated_observations=concatenate(last),
+        next_observations=None if following is None else take(following, slice(length)), episodes=table.episodes(),
     )  # fmt: skip
 
 
 def evaluate(
-    env: BatchedEnv, weights: MlpWeights, contexts: FloatArray, seeds: NDArray[np.uint64], *, gamma: float
+    env: BatchedEnv, policy: Policy, contexts: FloatArray, seeds: NDArray[np.uint64], *, gamma: float
 ) -> Outcomes:
     """One deterministic episode per row of `contexts` (n_slots, d), all at once."""
     slots = np.arange(env.n_slots)
-    observations = env.reset(slots, contexts, seeds)
+    observations = take(env.reset(slots, contexts, seeds), slice(None))
     alive = np.ones(env.n_slots, dtype=np.bool_)
     returns, discounted, success = np.zeros(env.n_slots), np.zeros(env.n_slots), np.full(env.n_slots, np.nan)
     lengths = np.zeros(env.n_slots, dtype=np.int64)
     discount = 1.0
     while alive.any():
-        step = env.step(executed(env.action_space, act(weights, observations, None)))
+        step = env.step(policy.head.executed(policy.head.best(policy.outputs(observations))))
         returns += np.where(alive, step.rewards, 0.0)
         discounted += np.where(alive, discount * step.rewards, 0.0)
         lengths += alive
@@ -357,35 +295,27 @@ def evaluate(
         discount *= gamma
         ended = np.flatnonzero(step.terminated | step.truncated)
         alive[ended] = False
-        observations = step.observations.copy()
+        put(observations, slice(None), step.observations)
         if len(ended) and alive.any():  # every slot must be steppable; what follows in these is not counted
-            observations[ended] = env.reset(ended, contexts[ended], seeds[ended])
-    return Outcomes(weights.version, returns, discounted, lengths, success)
+            put(observations, ended, env.reset(ended, contexts[ended], seeds[ended]))
+    return Outcomes(policy.version, returns, discounted, lengths, success)
 
 
-def start_observations(setup: Setup, chunk: int) -> Array:
-    """`(chunk_size * start_states, obs_dim)` where a chunk's episodes begin; on an environment of its own."""
+def start_observations(setup: Setup, chunk: int) -> Observations:
+    """`(chunk_size * start_states, ...)` where a chunk's episodes begin; on an environment of its own."""
     first = chunk * setup.chunk_size
     contexts = setup.train.contexts[first : first + setup.chunk_size]
     contexts = np.repeat(contexts, setup.start_states, axis=0)
-    env = make_batched(setup.env_id, len(contexts), context_visible=setup.context_visible)
+    env = setup.make_env(len(contexts))
     seeds = episode_seeds(setup.seed, Purpose.START_STATES, chunk, count=len(contexts))
-    return env.reset(np.arange(len(contexts)), contexts, seeds).copy()
+    return take(env.reset(np.arange(len(contexts)), contexts, seeds), slice(None))
 
 
 def joined(parts: list[Outcomes]) -> Outcomes:
     """The parts of one split's evaluation as one, in order."""
-    fields = [field.name for field in dataclasses.fields(Outcomes) if field.name != "weights_version"]
-    return Outcomes(parts[0].weights_version, **{name: np.concatenate([getattr(part, name) for part in parts])
+    fields = [field.name for field in dataclasses.fields(Outcomes) if field.name != "policy_version"]
+    return Outcomes(parts[0].policy_version, **{name: np.concatenate([getattr(part, name) for part in parts])
                                                  for name in fields})  # fmt: skip
-
-
-def _action_noise(
-    space: spaces.Space[NDArray[np.generic]], random: np.random.Generator, shape: tuple[int, int]
-) -> Array:
-    if isinstance(space, spaces.Discrete):
-        return random.gumbel(size=(*shape, int(space.n))).astype(np.float32)
-    return random.standard_normal(size=(*shape, *(space.shape or ())), dtype=np.float32)
 
 
 class _EpisodeTable:

@@ -2,10 +2,10 @@
 
     select   curriculum.start()                          one instance (SPaCE), all (round robin), ...
     repeat
-        collect  cluster.collect(weights, selection)     exactly n_steps transitions, in shards
+        collect  cluster.collect(policy, selection)      exactly n_steps transitions, in shards
         update   learner.update(shards)                  SB3's own train()
         until the selection was passed over once at full horizon, then
-        revalue  cluster.start_values(weights)           V(s0, c) of every instance, straight to the curriculum
+        revalue  cluster.start_values(policy)            V(s0, c) of every instance, straight to the curriculum
         select   cluster.decide(state, before, after)    the next selection
     now and then: evaluate on all instances, and commit to the ledger
 
@@ -19,38 +19,41 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from space_dist.cluster import Cluster, Decision, Handle, checked, make_curriculum
 from space_dist.config import RunConfig
 from space_dist.curricula import Selection, State
-from space_dist.envs import make_batched
+from space_dist.envs import BatchedEnv, make_batched
+from space_dist.envs.observations import alike
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
-from space_dist.learner import Learner, Update
-from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Status
+from space_dist.learner import Arrays, Learner, Update, make_learner
+from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
+from space_dist.policy import MlpPolicy, Policy, blind, to_arrays
 from space_dist.rollout import (
     CUT,
-    MlpWeights,
     Outcomes,
     Setup,
     Shard,
     Walk,
     joined,
-    to_arrays,
 )
 
 log = logging.getLogger("space_dist")
 
+PROBE = (1 << 32) - 1  # the round in which first scales are measured
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
 
 
 def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setup:
     """What workers must know. Raises ConfigError if the config cannot work with its environment or instances."""
+    horizon = make_env(config).horizon
     setup = Setup(
         env_id=config.env.id,
         context_visible=config.env.context_visible,
@@ -58,17 +61,24 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         gamma=config.learner.gamma,
         shards=config.rollout.shards,
         slots=config.rollout.slots,
-        slot_length=config.slot_length,
+        slot_length=config.slot_length(horizon),
         start_states=config.rollout.start_states,
         evaluation_episodes=config.evaluation.episodes,
         train=train,
         test=test,
+        env_kwargs=config.env.kwargs,
+        episodes_per_round=config.n_episodes,
+        keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
     )
-    horizon = make_batched(config.env.id, 1, context_visible=False).horizon
-    if config.slot_length < horizon:
+    if config.budget.steps < config.round_steps(horizon):
+        raise ConfigError(
+            f"budget.steps = {config.budget.steps} is less than the {config.round_steps(horizon)} steps that one round "
+            f"of learner.n_episodes = {config.n_episodes} episodes may take"
+        )
+    if setup.slot_length < horizon:
         raise ConfigError(
             f"learner.n_steps / (rollout.shards * rollout.slots) = {config.learner.n_steps} / ({config.rollout.shards} "
-            f"* {config.rollout.slots}) = {config.slot_length} steps per slot, less than the horizon of "
+            f"* {config.rollout.slots}) = {setup.slot_length} steps per slot, less than the horizon of "
             f"{config.env.id} ({horizon}): no episode could end. Use fewer shards or slots, or larger updates"
         )
     curriculum = config.curriculum
@@ -90,9 +100,9 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
 def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
     """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
     slots = min(len(train), _COMPARED_STARTS)
-    env = make_batched(config.env.id, slots, context_visible=config.env.context_visible)
-    starts = env.reset(np.arange(slots), train.contexts[:slots], np.zeros(slots, dtype=np.uint64))
-    return slots > 1 and bool((starts == starts[0]).all())
+    seeds = np.zeros(slots, dtype=np.uint64)
+    starts = make_env(config, slots).reset(np.arange(slots), train.contexts[:slots], seeds)
+    return slots > 1 and alike(starts)
 
 
 @dataclass
@@ -113,6 +123,8 @@ class _Run:
     """Everything that changes from round to round; `_save` and `_restore` know every field that must survive."""
 
     round: int = 0
+    steps: int = 0  # real environment steps
+    episodes: int = 0  # of training, begun
     iteration: int = 1
     rounds_left: int | None = None  # in this iteration; None until the selection is known
     version: int = 0  # of the selection being trained on
@@ -122,6 +134,8 @@ class _Run:
     rollouts: list[dict[str, float]] = field(default_factory=list)  # of this iteration's rounds
     updates: list[dict[str, float]] = field(default_factory=list)
     gradient_steps: int = 0  # in this iteration
+    scored: Arrays = field(default_factory=dict)  # weights that `values` belong to, where scales change
+    segments: list[Segment] = field(default_factory=list)  # of the replay buffer, as of the last commit
     trained: Selection | None = None  # the selection being trained on, once known
     # Handles, and what they wait for
     state: Handle = None
@@ -154,9 +168,9 @@ class Training:
     ) -> None:
         self._config, self._setup, self._cluster, self._writer = config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
-        self._horizon = make_batched(config.env.id, 1, context_visible=False).horizon
-        self._total_steps = config.rounds * config.learner.n_steps
-        self.learner = make_learner(config)
+        self._horizon = make_env(config).horizon
+        self._total_steps = total_steps(config, self._horizon)
+        self.learner = learner_of(config)
         self._run = _Run()
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
@@ -167,37 +181,64 @@ class Training:
         """Train to the end of the budget. Raises Interrupted, after a commit, if asked to stop."""
         run, cluster, config = self._run, self._cluster, self._config
         checkpoint = self._writer.restore()
-        weights = self._restore(checkpoint) if checkpoint else self._begin()
-        while run.round < config.rounds:
+        policy = self._restore(checkpoint) if checkpoint else self._begin()
+        while not self._is_over():
             shards: list[Shard] = self._wait_for(
-                cluster.collect(weights, run.selection, run.walk, round=run.round, version=run.version)
+                cluster.collect(
+                    policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version
+                )
             )
-            update = self.learner.update(shards, round=run.round, steps=self._steps(run.round + 1))
+            steps = run.steps + sum(shard.steps for shard in shards)
+            update = self.learner.update(shards, round=run.round, steps=steps)
             self._account(shards, update)
-            weights = cluster.put(self.learner.weights(run.round))
+            policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
-                self._decide(weights)
-            if self._steps() >= next_evaluation(config.evaluation.every_steps, run.evaluated_at, self._total_steps):
-                self._evaluate(weights)
+                self._decide(policy)
+            if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
+                self._evaluate(policy)
             self._show()
             self._commit_if_due()
         self._finish()
+
+    def _is_over(self) -> bool:
+        """Whether another round would exceed the budget."""
+        run, budget = self._run, self._config.budget
+        enough = budget.episodes is not None and run.episodes >= budget.episodes
+        return enough or run.steps + self._config.round_steps(self._horizon) > budget.steps
 
     # ---- the parts of an iteration ----
 
     def _begin(self) -> Handle:
         cluster = self._cluster
-        weights = cluster.put(self.learner.weights(0))
-        self._adopt(cluster.begin(cluster.start_values(weights)))
-        self._evaluate(weights)
-        return weights
+        if self.learner.normalises:
+            self._probe()
+        policy = cluster.put(self.learner.policy(0))
+        self._adopt(cluster.begin(cluster.start_values(policy)))
+        self._evaluate(policy)
+        return policy
 
-    def _decide(self, weights: Handle) -> None:
+    def _probe(self) -> None:
+        """One round of actions that ignore the observation gives the first scales; its steps count like any others."""
+        run, cluster = self._run, self._cluster
+        selection = make_curriculum(self._config, self._setup.train).start()[1]
+        seeing = self.learner.policy(0)
+        policy = blind(seeing, self._setup.make_env(1).action_space, PROBE)
+        handles = cluster.collect(
+            cluster.put(policy), cluster.put(selection), run.walk, round=PROBE, steps=0, version=selection.version
+        )  # fmt: skip
+        shards: list[Shard] = cluster.get(handles)
+        self.learner.observe(shards)
+        run.steps += sum(shard.steps for shard in shards)
+
+    def _decide(self, policy: Handle) -> None:
         """Revalue all instances and let the curriculum choose; the answer is picked up at the next wait."""
         run, cluster = self._run, self._cluster
+        rescored = []
+        if self.learner.normalises:  # both values at one scale: else a change of scale would look like progress
+            rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         decision = cluster.decide(
-            run.state, run.values, cluster.start_values(weights),
-            version=run.version, gradient_steps=run.gradient_steps,
+            run.state, run.values, cluster.start_values(policy),
+            version=run.version, gradient_steps=run.gradient_steps, rescored=rescored,
         )  # fmt: skip
         row = self._iteration_row(complete=True)
 
@@ -216,6 +257,8 @@ class Training:
         run = self._run
         run.state, run.selection, run.values = decision.state, decision.selection, decision.values
         run.rounds_left, run.trained = None, None
+        if self.learner.normalises:
+            run.scored = self.learner.scored()
 
         def settle(answers: list[Any]) -> None:
             self._know_selection(answers[0])
@@ -224,14 +267,15 @@ class Training:
 
     def _know_selection(self, selection: Selection) -> None:
         run, config = self._run, self._config
-        steps = config.rollout.passes * len(selection.ids) * self._horizon
-        run.rounds_left = max(1, math.ceil(steps / config.learner.n_steps))
+        episodes = config.rollout.passes * len(selection.ids)
+        per_round = config.n_episodes or config.learner.n_steps / self._horizon
+        run.rounds_left = max(1, math.ceil(episodes / per_round))
         run.trained = selection
         self.progress.set_size = len(selection.ids)
 
-    def _evaluate(self, weights: Handle) -> None:
+    def _evaluate(self, policy: Handle) -> None:
         run, cluster = self._run, self._cluster
-        train, test = cluster.evaluate(weights, "train"), cluster.evaluate(weights, "test")
+        train, test = cluster.evaluate(policy, "train"), cluster.evaluate(policy, "test")
         row: Row = {"kind": "evaluation", **self._position()}
 
         def settle(answers: list[Any]) -> None:
@@ -243,12 +287,12 @@ class Training:
             log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
 
         run.pending.append(_Pending([*train, *test], settle))
-        run.evaluated_at = self._steps()
+        run.evaluated_at = run.steps
 
     def _account(self, shards: list[Shard], update: Update) -> None:
         run = self._run
         for shard in shards:
-            if (shard.weights_version, shard.selection_version, shard.round) != (run.round, run.version, run.round):
+            if (shard.policy_version, shard.selection_version, shard.round) != (run.round, run.version, run.round):
                 raise RuntimeError(f"shard {shard.shard} of round {run.round} answers another question")
         order, n_shards = shards[0].order_version, len(shards)
         selection = run.trained
@@ -266,6 +310,8 @@ class Training:
         run.gradient_steps += update.gradient_steps
         run.round += 1
         run.rounds_left -= 1
+        run.steps += sum(shard.steps for shard in shards)
+        run.episodes += sum(len(shard.episodes) for shard in shards)
 
     def _finish(self) -> None:
         run = self._run
@@ -274,7 +320,7 @@ class Training:
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
             run.rollouts, run.updates = [], []
         self._commit("done")
-        arrays, description = to_arrays(self.learner.weights(run.round))
+        arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
         self._writer.write_model(arrays, {**description, "context_visible": self._config.env.context_visible})
         self._writer.set_status(self._new_status("done"))
@@ -300,7 +346,7 @@ class Training:
         if run.trained is None:
             raise RuntimeError("an iteration ended before its selection was known")
         self._writer.append(
-            CURRICULUM, {"iteration": run.iteration, "steps": self._steps(), "trained": run.trained.ids.tolist()}
+            CURRICULUM, {"iteration": run.iteration, "steps": run.steps, "trained": run.trained.ids.tolist()}
         )
         totals = {name: sum(one[name] for one in run.rollouts) for name in run.rollouts[0]}
         finished = totals["finished"]
@@ -322,7 +368,7 @@ class Training:
         }
 
     def _position(self) -> Row:
-        return {"iteration": self._run.iteration, "round": self._run.round, "steps": self._steps()}
+        return {"iteration": self._run.iteration, "round": self._run.round, "steps": self._run.steps}
 
     def _append(self, row: Row) -> None:
         now = time.monotonic()
@@ -342,7 +388,7 @@ class Training:
         reason = self._stop_requested()
         if reason is not None:
             self._commit("interrupted", reason)
-            raise Interrupted(f"stopped by {reason} after {self._steps()} steps; --resume continues")
+            raise Interrupted(f"stopped by {reason} after {self._run.steps} steps; --resume continues")
         settings = self._config.checkpoint
         if (
             self._run.round - self._last_commit_round >= settings.every_rounds
@@ -354,12 +400,15 @@ class Training:
         self._settle()
         # A run is done only once its model is written.
         status = self._new_status("running" if state == "done" else state, message)
+        older = {segment.name for segment in self._run.segments}
         self._writer.commit(self._save(), status)
+        if self._run.segments:
+            self._writer.drop_segments(older | {segment.name for segment in self._run.segments})
         self._last_commit_time, self._last_commit_round = time.monotonic(), self._run.round
 
     def _new_status(self, state: Any, message: str | None = None) -> Status:
         return dataclasses.replace(
-            self._status, state=state, message=message, steps=self._steps(), round=self._run.round,
+            self._status, state=state, message=message, steps=self._run.steps, round=self._run.round,
             updated_at=time.time(),
         )  # fmt: skip
 
@@ -372,22 +421,42 @@ class Training:
         arrays["curriculum/selected"] = state.selected
         fields = [item.name for item in dataclasses.fields(state) if item.name != "selected"]
         numbers = {name: getattr(state, name) for name in fields}
+        arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
+        self._store_transitions()
         data = {
             "learner": learner,
             "curriculum": numbers,
             "run": {
-                "round": run.round, "iteration": run.iteration, "rounds_left": run.rounds_left, "version": run.version,
+                "round": run.round, "steps": run.steps, "episodes": run.episodes, "iteration": run.iteration,
+                "rounds_left": run.rounds_left, "version": run.version,
                 "walk": [run.walk.order_version, list(run.walk.positions)], "rows": run.rows,
                 "evaluated_at": run.evaluated_at, "rollouts": run.rollouts, "updates": run.updates,
                 "gradient_steps": run.gradient_steps,
             },
         }  # fmt: skip
-        return Checkpoint(run.round, arrays, data)
+        return Checkpoint(run.round, arrays, data, tuple(run.segments))
+
+    def _store_transitions(self) -> None:
+        """Write what is new in the replay buffer; forget pieces that the buffer has forgotten."""
+        run, learner = self._run, self.learner
+        remembered = learner.seen - learner.capacity
+        run.segments = [segment for segment in run.segments if segment.first + segment.count > remembered]
+        stored = run.segments[-1].first + run.segments[-1].count if run.segments else 0
+        first = max(stored, remembered, 0)
+        if learner.seen > first:
+            segment = self._writer.write_segment(first, learner.seen - first, learner.transitions(first))
+            run.segments.append(segment)
 
     def _restore(self, checkpoint: Checkpoint) -> Handle:
         run, cluster, data = self._run, self._cluster, checkpoint.data["run"]
         _load_learner(self.learner, checkpoint)
-        for name in ("round", "iteration", "version", "rows", "evaluated_at", "rollouts", "updates", "gradient_steps"):
+        run.segments = list(checkpoint.segments)
+        for segment in run.segments:
+            self.learner.remember(self._writer.read_segment(segment), segment.first)
+        for name in (
+            "round", "steps", "episodes", "iteration", "version", "rows", "evaluated_at", "rollouts", "updates",
+            "gradient_steps",
+        ):  # fmt: skip
             setattr(run, name, data[name])
         order, positions = data["walk"]
         run.walk = Walk(order, tuple(positions))
@@ -397,53 +466,71 @@ class Training:
         run.rounds_left = data["rounds_left"]
         run.state, run.selection = cluster.put(state), cluster.put(selection)
         run.values = cluster.put(checkpoint.arrays["curriculum/values"])
-        self._last_commit_round, self._last_row_steps = run.round, self._steps()
-        return cluster.put(self.learner.weights(run.round))
-
-    # ---- small things ----
-
-    def _steps(self, round: int | None = None) -> int:
-        return (self._run.round if round is None else round) * self._config.learner.n_steps
+        run.scored = _under("scored/", checkpoint.arrays)
+        self._last_commit_round, self._last_row_steps = run.round, run.steps
+        return cluster.put(self.learner.policy(run.round))
 
     def _show(self) -> None:
-        self.progress.steps = self._steps()
+        self.progress.steps = self._run.steps
         self._observe(self.progress)
 
 
-def make_learner(config: RunConfig) -> Learner:
-    """A config's learner with its initial network."""
-    env = make_batched(config.env.id, 1, context_visible=config.env.context_visible)
-    return Learner(
+def make_env(config: RunConfig, n_slots: int = 1) -> BatchedEnv:
+    """A config's environment, as its policy sees it."""
+    env = config.env
+    return make_batched(env.id, n_slots, context_visible=env.context_visible, kwargs=env.kwargs)
+
+
+def total_steps(config: RunConfig, horizon: int) -> int:
+    """Environment steps of a whole run: those of the rounds that fit; the budget, where rounds end by episodes."""
+    if config.n_episodes is not None:
+        return config.budget.steps
+    return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
+
+
+def learner_of(config: RunConfig) -> Learner:
+    """A config's learner with its initial networks."""
+    env = make_env(config)
+    return make_learner(
         config.learner, env.observation_space, env.action_space,
-        seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots, slot_length=config.slot_length,
-        total_steps=config.rounds * config.learner.n_steps,
+        seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots,
+        slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
     )  # fmt: skip
 
 
-def policy_in(checkpoint: Checkpoint, config: RunConfig) -> MlpWeights:
+def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy:
     """The policy that a checkpoint holds."""
-    learner = make_learner(config)
+    learner = learner_of(config)
     _load_learner(learner, checkpoint)
-    return learner.weights(checkpoint.round)
+    return learner.policy(checkpoint.round)
+
+
+def model_of(learner: Learner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """A trained policy as arrays and a description: layer by layer, or as torch's state where NumPy cannot act."""
+    policy = learner.policy(version)
+    if isinstance(policy, MlpPolicy):
+        return to_arrays(policy)
+    arrays = learner.scored()
+    return arrays, {
+        "format": 2, "version": version, "policy": "torch", "class": str(type(learner.model.policy)),
+        "shapes": {name: list(array.shape) for name, array in arrays.items()},
+    }  # fmt: skip
 
 
 def _load_learner(learner: Learner, checkpoint: Checkpoint) -> None:
-    prefix = "learner/"
-    arrays = {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
-    learner.load(arrays, checkpoint.data["learner"])
+    learner.load(_under("learner/", checkpoint.arrays), checkpoint.data["learner"])
 
 
-def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int, total_steps: int) -> float:
-    """Steps at which the next evaluation falls due; it is made after the first update at or behind them.
+def _under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
-    The end is always evaluated; after it, nothing is (infinity).
-    """
-    if evaluated_at >= total_steps:
-        return math.inf
+
+def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int:
+    """Steps at which the next evaluation falls due; it is made after the first update at or behind them."""
     if every_steps == "log":
-        marks = (factor * 10**power for power in range(3, 13) for factor in (1, 3))
-        return min(next((mark for mark in marks if mark > evaluated_at), total_steps), total_steps)
-    return min((evaluated_at // every_steps + 1) * every_steps, total_steps)
+        marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
+        return next(mark for mark in marks if mark > evaluated_at)
+    return (evaluated_at // every_steps + 1) * every_steps
 
 
 def _rollout_sums(shards: list[Shard]) -> dict[str, float]:

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
 
 from space_dist.envs.cartpole import BatchedCartPole
 from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
+from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.errors import ConfigError, nearest
 
-BATCHED: dict[str, Callable[[int], BatchedEnv]] = {
+BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
     "space_dist/CartPole-v0": BatchedCartPole,
 }
 
 
-def make_single(env_id: str) -> SingleEnv:
+def make_single(env_id: str, **kwargs: Any) -> SingleEnv:
     """The Gymnasium environment behind a registered id."""
-    return SingleEnv(BATCHED[env_id])
+    return SingleEnv(lambda n_slots: BATCHED[env_id](n_slots, **kwargs))
 
 
 for _id in BATCHED:
@@ -30,13 +33,24 @@ for _id in BATCHED:
         gym.register(id=_id, entry_point="space_dist.envs:make_single", kwargs={"env_id": _id}, order_enforce=True)
 
 
-def make_batched(env_id: str, n_slots: int, *, context_visible: bool) -> BatchedEnv:
+def make_batched(
+    env_id: str, n_slots: int, *, context_visible: bool, kwargs: Mapping[str, Any] = MappingProxyType({})
+) -> BatchedEnv:
     """Build a batched environment by registered id or by import path (`my_package.my_module:make`).
 
-    A function at an import path is called with the number of slots and returns a `BatchedEnv`.
-    Raises ConfigError if there is no such environment.
+    A function at an import path is called with the number of slots, and `kwargs`, and returns a `BatchedEnv`.
+    Raises ConfigError if there is no such environment, or none with such arguments.
     """
-    env: BatchedEnv = _find(env_id)(n_slots)
+    make = _find(env_id)
+    if kwargs:
+        try:
+            inspect.signature(make).bind(n_slots, **kwargs)
+        except TypeError as error:
+            raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
+    try:
+        env: BatchedEnv = make(n_slots, **kwargs)
+    except (Exception, SystemExit) as error:  # somebody else's code may raise anything
+        raise ConfigError(f"env.id {env_id!r} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
                if not hasattr(env, name)]  # fmt: skip
     if missing:
@@ -55,8 +69,9 @@ def _find(env_id: str) -> Callable[[int], Any]:
         )
     try:
         found = getattr(importlib.import_module(module_name), name, None)
-    except (ImportError, SyntaxError, ValueError) as error:
-        raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {error}") from None
+    except (Exception, SystemExit) as error:  # somebody else's module may raise anything
+        what = f"{type(error).__name__}: {str(error)[:200]}"
+        raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {what}") from error
     if not callable(found):
         raise ConfigError(f"env.id {env_id!r}: {module_name!r} has no function {name!r}")
     made: Callable[[int], Any] = found
@@ -69,6 +84,7 @@ __all__ = [
     "BatchedPointMass",
     "ContextObservation",
     "ContextVisible",
+    "Observations",
     "SingleEnv",
     "Step",
     "make_batched",

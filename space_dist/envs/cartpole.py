@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.interface import IntArray, Observations, Step
+from space_dist.envs.interface import IntArray, Step
 from space_dist.instances import CARTPOLE_BOUNDS
 
 GRAVITY = 9.8
@@ -52,7 +52,7 @@ class BatchedCartPole:
         self._length = np.ones(n_slots)
         self._time = np.zeros(n_slots, dtype=np.int64)
 
-    def reset(self, slots: IntArray, contexts: NDArray[np.float64], seeds: NDArray[np.uint64]) -> Observations:
+    def reset(self, slots: IntArray, contexts: NDArray[np.float64], seeds: NDArray[np.uint64]) -> NDArray[np.float32]:
         """Start new episodes near the upright."""
         for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
             self._state[:, slot] = np.random.default_rng(seed).uniform(-START_LIMIT, START_LIMIT, size=4)
@@ -87,5 +87,5 @@ class BatchedCartPole:
             rewards[fallen | truncated] = self._end_reward
         return Step(self._observe(), rewards, terminated=fallen, truncated=truncated, success=truncated.copy())
 
-    def _observe(self) -> Observations:
+    def _observe(self) -> NDArray[np.float32]:
         return self._state.T.astype(np.float32, order="C")

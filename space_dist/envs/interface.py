@@ -10,10 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from space_dist.envs.observations import Observations
 from space_dist.instances import ContextBounds
 
 FloatArray = NDArray[np.float64]
-Observations = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
@@ -22,7 +22,7 @@ IntArray = NDArray[np.int64]
 class Step:
     """What one step of all slots gave.
 
-    observations: (n_slots, obs_dim) after the step; nothing resets by itself.
+    observations: (n_slots, *observation_shape) after the step, or a dictionary of such; nothing resets by itself.
     rewards: (n_slots,).  terminated, truncated: (n_slots,).
     success: (n_slots,) whether the goal is reached *now*; None where the environment knows no success.
     """
@@ -49,8 +49,8 @@ class BatchedEnv(Protocol):
         """Steps after which an episode is truncated."""
 
     @property
-    def observation_space(self) -> spaces.Box:
-        """Of one slot."""
+    def observation_space(self) -> spaces.Space[Any]:
+        """Of one slot: a Box, or a Dict of Boxes."""
 
     @property
     def action_space(self) -> spaces.Space[Any]:
@@ -61,7 +61,7 @@ class BatchedEnv(Protocol):
         """Names and bounds of a context's features."""
 
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
-        """Start new episodes in `slots` (k,), with `contexts` (k, d) and `seeds` (k,); returns (k, obs_dim)."""
+        """Start new episodes in `slots` (k,), with `contexts` (k, d) and `seeds` (k,); returns (k, ...)."""
 
     def step(self, actions: NDArray[np.generic]) -> Step:
         """Step every slot. actions: (n_slots, *action_shape). A slot whose episode has ended must be reset first."""
@@ -71,28 +71,44 @@ MakeBatched = Callable[[int], BatchedEnv]
 
 
 class ContextVisible:
-    """A batched environment whose observations end with the context, scaled from its bounds to [-1, 1]."""
+    """A batched environment whose observations hold the context, scaled from its bounds to [-1, 1].
+
+    It is appended to flat observations; images and dictionaries become dictionaries with a part `context`.
+    """
 
     def __init__(self, env: BatchedEnv) -> None:
         self._env = env
         self.n_slots, self.horizon = env.n_slots, env.horizon
         self.action_space, self.context_bounds = env.action_space, env.context_bounds
-        space, n_features = env.observation_space, len(env.context_bounds.names)
-        # Contexts outside their bounds are refused where they are read, but a sampler's rounding may touch them.
-        self.observation_space = spaces.Box(
-            np.concatenate([space.low, np.full(n_features, -1.0)]).astype(np.float32),
-            np.concatenate([space.high, np.full(n_features, 1.0)]).astype(np.float32),
-            dtype=np.float32,
-        )
+        inner, n_features = env.observation_space, len(env.context_bounds.names)
+        context = spaces.Box(-1.0, 1.0, shape=(n_features,), dtype=np.float32)
+        self.observation_space: spaces.Space[Any]
+        if isinstance(inner, spaces.Box) and len(inner.shape) == 1:
+            self.observation_space = spaces.Box(
+                np.concatenate([inner.low, context.low]).astype(np.float32),
+                np.concatenate([inner.high, context.high]).astype(np.float32),
+                dtype=np.float32,
+            )
+        else:
+            parts = inner.spaces if isinstance(inner, spaces.Dict) else {"observation": inner}
+            self.observation_space = spaces.Dict({**parts, "context": context})
         self._scaled = np.zeros((env.n_slots, n_features), dtype=np.float32)
 
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
-        """As the wrapped environment's, with the context appended."""
+        """As the wrapped environment's, with the context."""
+        # Contexts outside their bounds are refused where they are read, but a sampler's rounding may touch them.
         self._scaled[slots] = np.clip(self.context_bounds.scale(contexts), -1.0, 1.0)
-        return np.concatenate([self._env.reset(slots, contexts, seeds), self._scaled[slots]], axis=1)
+        return self._with_context(self._env.reset(slots, contexts, seeds), self._scaled[slots])
 
     def step(self, actions: NDArray[np.generic]) -> Step:
-        """As the wrapped environment's, with the context appended."""
+        """As the wrapped environment's, with the context."""
         step = self._env.step(actions)
-        observations = np.concatenate([step.observations, self._scaled], axis=1)
+        observations = self._with_context(step.observations, self._scaled.copy())
         return Step(observations, step.rewards, step.terminated, step.truncated, step.success)
+
+    def _with_context(self, observations: Observations, context: NDArray[np.float32]) -> Observations:
+        if isinstance(observations, dict):
+            return {**observations, "context": context}
+        if isinstance(self.observation_space, spaces.Dict):
+            return {"observation": observations, "context": context}
+        return np.concatenate([observations, context], axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
+from space_dist.envs.interface import FloatArray, IntArray, Step
 from space_dist.instances import POINTMASS_BOUNDS
 
 DT = 0.01  # seconds per inner step
@@ -45,7 +45,7 @@ class BatchedPointMass:
         self._seeds = np.zeros(n_slots, dtype=np.uint64)
         self._noise = np.zeros((n_slots, horizon, INNER_STEPS, 2))
 
-    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> NDArray[np.float32]:
         """Start new episodes at (0, 3), at rest."""
         self._position[:, slots] = START[[0, 2], None]
         self._velocity[:, slots] = START[[1, 3], None]
@@ -98,7 +98,7 @@ class BatchedPointMass:
                     break
         return crashed
 
-    def _observe(self) -> Observations:
+    def _observe(self) -> NDArray[np.float32]:
         x, y = self._position
         vx, vy = self._velocity
         return np.stack([x, vx, y, vy], axis=1).astype(np.float32)

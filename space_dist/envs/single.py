@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.interface import MakeBatched
+from space_dist.envs.observations import each
 
 
 class SingleEnv(gym.Env[Any, Any]):
@@ -23,7 +24,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def __init__(self, make_batched: MakeBatched) -> None:
         self._env = make_batched(1)
-        self.observation_space: spaces.Box = self._env.observation_space
+        self.observation_space = self._env.observation_space
         self.action_space = self._env.action_space
         bounds = self._env.context_bounds
         self.context_space = spaces.Box(bounds.low, bounds.high, dtype=np.float64)
@@ -32,7 +33,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode; `seed` alone decides its noise. Raises ValueError for a context outside its bounds."""
         super().reset(seed=seed)
         if options is not None and "context" in options:
@@ -48,14 +49,14 @@ class SingleEnv(gym.Env[Any, Any]):
         observations = self._env.reset(
             np.array([0]), context[None, :], np.array([episode], dtype=np.uint64)
         )  # fmt: skip
-        return observations[0], {"context": context.copy()}
+        return each(_first, observations), {"context": context.copy()}
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step; `info["success"]` where the environment knows success."""
         step = self._env.step(np.asarray(action)[None])
         info = {} if step.success is None else {"success": bool(step.success[0])}
         return (
-            step.observations[0],
+            each(_first, step.observations),
             float(step.rewards[0]),
             bool(step.terminated[0]),
             bool(step.truncated[0]),
@@ -65,6 +66,12 @@ class SingleEnv(gym.Env[Any, Any]):
     def _draw_context(self) -> NDArray[np.float64]:
         bounds = self._env.context_bounds
         return self.np_random.uniform(bounds.low, bounds.high)
+
+
+def _first(array: NDArray[Any]) -> NDArray[Any]:
+    """The only slot's."""
+    slot: NDArray[Any] = array[0]
+    return slot
 
 
 class ContextObservation(

@@ -1,0 +1,45 @@
+"""The Stable-Baselines3 adapter: networks, updates, and what a checkpoint must hold of them.
+
+Nothing of SB3 is written twice: what shards collected is put into SB3's own buffers, and SB3's own `train()` learns
+from it. What SB3 does outside `train()` while it collects is done here, per transition.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from gymnasium import spaces
+
+from space_dist.config import A2CConfig, DQNConfig, LearnerConfig, PPOConfig, SACConfig, TD3Config, TRPOConfig
+from space_dist.learner.interface import Arrays, Learner, Update
+from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
+from space_dist.learner.on_policy import OnPolicyLearner
+
+
+def make_learner(
+    config: LearnerConfig,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    *,
+    seed: int,
+    n_slots: int,
+    slot_length: int,
+    total_steps: int,
+) -> Learner:
+    """A config's learner with its initial networks, seeded.
+
+    n_slots, slot_length: of a round, over all shards; total_steps: of the run, for schedules.
+    Raises ConfigError if the learner cannot work with these spaces.
+    """
+    torch.set_num_threads(1)  # 1 and 2 threads give different gradients
+    if isinstance(config, PPOConfig | TRPOConfig | A2CConfig):
+        return OnPolicyLearner(
+            config, observation_space, action_space,
+            seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
+        )  # fmt: skip
+    kinds: dict[type, type[OffPolicyLearner]] = {DQNConfig: DQNLearner, SACConfig: SACLearner, TD3Config: TD3Learner}
+    return kinds[type(config)](config, observation_space, action_space, seed=seed, total_steps=total_steps)
+
+
+__all__ = ["Arrays", "Learner", "OffPolicyLearner", "OnPolicyLearner", "Update", "make_learner"]

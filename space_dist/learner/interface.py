@@ -1,0 +1,271 @@
+"""What every learner does, and what all of them share: seeding, saving, and how divergence is told."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
+
+from space_dist.config import LearnerConfig
+from space_dist.envs import Observations
+from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.learner.networks import is_mlp, torch_policy
+from space_dist.learner.normaliser import Normaliser
+from space_dist.policy import Policy, Statistics
+from space_dist.rollout import Shard
+from space_dist.seeding import Purpose, global_generators, seed_sequence
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one update reported: SB3's own training metrics, and how many optimiser steps the scored network took."""
+
+    metrics: dict[str, float]
+    gradient_steps: int
+
+
+class Learner(abc.ABC):
+    """One of Stable-Baselines3's algorithms, on transitions that somebody else collected.
+
+    model: SB3's algorithm object; it has no environment.
+    """
+
+    model: Any
+
+    keeps_next_observations = False
+
+    def __init__(
+        self,
+        config: LearnerConfig,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        *,
+        seed: int,
+        total_steps: int,
+    ) -> None:
+        self._config, self._seed, self._total_steps = config, seed, total_steps
+        _refuse_spaces(config, observation_space, action_space)
+        self._normaliser = (
+            Normaliser(observation_space, config.gamma, config.normalize_observations, config.normalize_rewards)
+            if config.normalize_observations or config.normalize_rewards
+            else None
+        )
+        with _seeded(seed, Purpose.INITIAL_NETWORK):
+            self.model = self._build(observation_space, action_space)
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
+
+    @abc.abstractmethod
+    def _build(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> BaseAlgorithm:
+        """SB3's algorithm with fresh networks."""
+
+    @abc.abstractmethod
+    def _mlp(self, version: int, statistics: Statistics) -> Policy:
+        """The networks for NumPy: copies."""
+
+    @abc.abstractmethod
+    def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
+        """Fill SB3's buffer and train. `steps`: of the run, with these shards."""
+
+    @abc.abstractmethod
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """All of them, by name; the one of the scored network first."""
+
+    @property
+    def normalises(self) -> bool:
+        """Whether observations or rewards are normalised: start values must then be compared at one scale."""
+        return self._normaliser is not None
+
+    @property
+    def statistics(self) -> Statistics:
+        """The scales in force: what actors act with until the next update."""
+        return self._normaliser.statistics if self._normaliser else Statistics()
+
+    def policy(self, version: int) -> Policy:
+        """A copy of the policy and its value function, for actors."""
+        if is_mlp(self._config, self.model.observation_space):
+            return self._mlp(version, self.statistics)
+        return torch_policy(self._config, self.model, version, self.statistics, self._head())
+
+    def scored(self) -> Arrays:
+        """The weights of the networks as they are, for `policy_of` to score later under later scales."""
+        return {name: _copy(tensor) for name, tensor in self.model.policy.state_dict().items()}
+
+    def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Policy:
+        """The policy of earlier weights, under the scales in force now."""
+        now = self.scored()
+        self.model.policy.load_state_dict({name: torch.as_tensor(array.copy()) for name, array in scored.items()})
+        try:
+            return self.policy(version)
+        finally:
+            self.model.policy.load_state_dict({name: torch.as_tensor(array) for name, array in now.items()})
+
+    @abc.abstractmethod
+    def _head(self) -> Any:
+        """How outputs become actions."""
+
+    def observe(self, shards: Sequence[Shard]) -> None:
+        """Take a round's transitions into the statistics, in shard order, without learning from them."""
+        if self._normaliser is not None:
+            self._normaliser.update(shards)
+
+    def update(self, shards: Sequence[Shard], *, round: int, steps: int) -> Update:
+        """One update on one round's shards, in shard order. `steps`: environment steps including this round's.
+
+        Raises SpaceDistError if the networks are no longer numbers.
+        """
+        if [shard.shard for shard in shards] != list(range(len(shards))):
+            raise RuntimeError(f"shards arrived in the order {[shard.shard for shard in shards]}")
+        before = self._gradient_steps()
+        with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
+            self._learn(shards, steps=steps)
+            if not all(torch.isfinite(parameter).all() for parameter in self.model.policy.parameters()):
+                raise ValueError("a weight is not a number")
+        self.observe(shards)  # after learning: advantages and actions belong to the statistics that acted
+        recorded = self.model.logger.name_to_value
+        metrics = {
+            name.removeprefix("train/").removeprefix("rollout/"): float(value)
+            for name, value in recorded.items()
+            if isinstance(value, int | float | np.number) and np.isfinite(value)
+        }
+        recorded.clear()
+        return Update({**metrics, **self._more_metrics(metrics)}, self._gradient_steps() - before)
+
+    def _more_metrics(self, metrics: Mapping[str, float]) -> dict[str, float]:  # noqa: ARG002 - SAC's needs them
+        return {"reward_std": self.statistics.reward_std} if self.statistics.reward_std != 1.0 else {}
+
+    def _gradient_steps(self) -> int:
+        """Steps that the optimiser of the scored network has made so far."""
+        first = next(iter(self._optimizers().values()))
+        return max((int(state["step"]) for state in first.state.values()), default=0)
+
+    def save(self) -> tuple[Arrays, dict[str, Any]]:
+        """Arrays and plain data from which `load` restores the learner bit for bit; replay buffers apart."""
+        arrays: Arrays = {f"policy/{name}": _copy(tensor) for name, tensor in self.model.policy.state_dict().items()}
+        numbers: dict[str, float] = {}
+        for kind, optimizer in self._optimizers().items():
+            for index, slots in optimizer.state_dict()["state"].items():
+                for name, value in slots.items():
+                    if isinstance(value, torch.Tensor):
+                        arrays[f"optimizer/{kind}/{index}/{name}"] = _copy(value)
+                    else:
+                        numbers[f"{kind}/{index}/{name}"] = value
+        if self._normaliser is not None:
+            arrays |= {f"normaliser/{name}": array for name, array in self._normaliser.save().items()}
+        return arrays, {"n_updates": self.model._n_updates, "optimizer_numbers": numbers}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
+        """Restore what `save` gave."""
+        self.model.policy.load_state_dict(
+            {name.removeprefix("policy/"): torch.as_tensor(array.copy())
+             for name, array in arrays.items() if name.startswith("policy/")}
+        )  # fmt: skip
+        states: dict[str, dict[int, dict[str, Any]]] = {kind: {} for kind in self._optimizers()}
+        for name, array in arrays.items():
+            if name.startswith("optimizer/"):
+                _, kind, index, slot = name.split("/")
+                states[kind].setdefault(int(index), {})[slot] = torch.as_tensor(array.copy())
+        for name, number in data["optimizer_numbers"].items():
+            kind, index, slot = name.split("/")
+            states[kind].setdefault(int(index), {})[slot] = number
+        for kind, optimizer in self._optimizers().items():
+            groups = optimizer.state_dict()["param_groups"]
+            optimizer.load_state_dict({"state": states[kind], "param_groups": groups})
+        if self._normaliser is not None:
+            prefix = "normaliser/"
+            self._normaliser.load(
+                {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+            )
+        self.model._n_updates = int(data["n_updates"])
+
+    def transitions(self, first: int) -> Arrays:  # noqa: ARG002 - the signature of those that have a buffer
+        """What entered the replay buffer since it had seen `first` transitions; nothing where there is no buffer."""
+        return {}
+
+    @property
+    def seen(self) -> int:
+        """How many transitions have entered the replay buffer so far."""
+        return 0
+
+    @property
+    def capacity(self) -> int:
+        """How many the replay buffer remembers."""
+        return 0
+
+    def remember(self, arrays: Mapping[str, NDArray[Any]], first: int) -> None:  # noqa: ARG002 - as above
+        """Put back what `transitions(first)` gave. Raises RuntimeError where there is no buffer."""
+        raise RuntimeError("this learner keeps no replay buffer")
+
+
+def tensors(observations: Observations) -> Any:
+    """Observations as SB3's policies take them."""
+    if isinstance(observations, dict):
+        return {name: torch.as_tensor(np.ascontiguousarray(array)) for name, array in observations.items()}
+    return torch.as_tensor(np.ascontiguousarray(observations))
+
+
+def schedule(rate: float, kind: str) -> Any:
+    """A learning rate as SB3 takes it: a number, or a function of the remaining share of the run."""
+    return (lambda remaining: rate * remaining) if kind == "linear" else rate
+
+
+def _copy(tensor: torch.Tensor) -> NDArray[Any]:
+    array: NDArray[Any] = tensor.detach().cpu().numpy().copy()
+    return array
+
+
+def _refuse_spaces(
+    config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    kind = config.kind
+    flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
+    if config.policy == "MlpPolicy" and not flat:
+        raise ConfigError(
+            f"learner.policy: MlpPolicy needs flat observations (a one-dimensional Box), not {observation_space}; "
+            "CnnPolicy takes images, MultiInputPolicy dictionaries"
+        )
+    if isinstance(observation_space, spaces.Dict) and config.policy in ("MlpPolicy", "CnnPolicy"):
+        raise ConfigError(f"learner.policy: {config.policy} takes no dictionary observations; use MultiInputPolicy")
+    if config.normalize_observations and not flat:
+        raise ConfigError("learner.normalize_observations: only flat observations can be normalised")
+    continuous = isinstance(action_space, spaces.Box) and len(action_space.shape) == 1
+    discrete = isinstance(action_space, spaces.Discrete) and action_space.start == 0
+    if kind == "dqn" and not discrete:
+        raise ConfigError(f"learner.kind: dqn needs discrete actions (Discrete from 0), not {action_space}")
+    bounded = isinstance(action_space, spaces.Box) and action_space.is_bounded()
+    if kind in ("sac", "td3") and not (continuous and bounded):
+        raise ConfigError(f"learner.kind: {kind} needs bounded continuous actions (a flat Box), not {action_space}")
+    if not continuous and not discrete:
+        raise ConfigError(f"env.id: actions must be a one-dimensional Box or Discrete from 0, not {action_space}")
+
+
+@contextmanager
+def _seeded(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
+    """Python's, NumPy's and torch's global generators seeded for one piece of work, and restored."""
+    with global_generators(seed, purpose, *keys), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(seed_sequence(seed, purpose, *keys).generate_state(3, np.uint32)[2]))
+        yield
+
+
+@contextmanager
+def _divergence_explained(round: int) -> Iterator[None]:
+    """Users need the cause: torch refuses distributions of NaN, and steps beyond float32, with errors about tensors."""
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "overflow" not in str(error):
+            raise
+        raise SpaceDistError(
+            f"training diverged in update {round + 1}: the networks are no longer numbers. A smaller "
+            f"learner.learning_rate usually helps ({str(error).splitlines()[0][:120]})"
+        ) from error

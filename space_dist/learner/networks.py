@@ -1,0 +1,170 @@
+"""Networks on their way to the actors: NumPy arrays where they are multilayer perceptrons, through torch otherwise."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from sb3_contrib import TRPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+
+from space_dist.config import LearnerConfig
+from space_dist.envs import Observations
+from space_dist.errors import ConfigError
+from space_dist.policy import Array, Head, Layers, Statistics
+
+ALGORITHMS: dict[str, Any] = {
+    "ppo": PPO, "trpo": TRPO, "a2c": A2C, "dqn": DQN, "sac": SAC, "td3": TD3,
+}  # fmt: skip
+
+
+def is_mlp(config: LearnerConfig, observation_space: spaces.Space[Any]) -> bool:
+    """Whether a policy can act in NumPy."""
+    return config.policy == "MlpPolicy" and isinstance(observation_space, spaces.Box)
+
+
+def policy_kwargs(config: LearnerConfig) -> dict[str, Any]:
+    """What SB3's policies are made with."""
+    kwargs: dict[str, Any] = {
+        "net_arch": list(config.net_arch),
+        "activation_fn": torch.nn.Tanh if config.activation == "tanh" else torch.nn.ReLU,
+    }
+    if config.kind in ("ppo", "trpo", "a2c"):
+        kwargs["log_std_init"] = config.log_std_init
+    if config.kind == "a2c":
+        kwargs |= {"optimizer_class": torch.optim.Adam} if not config.use_rms_prop else {}
+    return kwargs
+
+
+def policy_class(config: LearnerConfig) -> str | type[BasePolicy]:
+    """SB3's name of a policy, or a class at an import path. Raises ConfigError if there is none."""
+    module_name, colon, name = config.policy.partition(":")
+    if not colon:
+        return config.policy
+    try:
+        found = getattr(importlib.import_module(module_name), name, None)
+    except (ImportError, SyntaxError, ValueError) as error:
+        raise ConfigError(f"learner.policy {config.policy!r}: cannot import {module_name!r}: {error}") from None
+    if not (isinstance(found, type) and issubclass(found, BasePolicy)):
+        raise ConfigError(f"learner.policy {config.policy!r}: {name!r} is no Stable-Baselines3 policy class")
+    return found
+
+
+def layers(state: Mapping[str, torch.Tensor], body: str, *heads: str) -> Layers:
+    """The linear layers of a `Sequential` named `body` (its numbered parts, in order), then `heads` side by side."""
+    names = {name.rsplit(".", 1)[0] for name in state if name.startswith(f"{body}.")}
+    numbered = sorted(names, key=lambda name: int(name.rsplit(".", 1)[1]))
+    sequence = [_linear(state, name) for name in numbered]
+    if heads:
+        parts = [_linear(state, head) for head in heads]
+        sequence.append(
+            (np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts]))
+        )
+    return tuple(sequence)
+
+
+def _linear(state: Mapping[str, torch.Tensor], name: str) -> tuple[Array, Array]:
+    weight, bias = state[f"{name}.weight"].detach().numpy(), state[f"{name}.bias"].detach().numpy()
+    return np.array(weight.T, order="C"), bias.copy()
+
+
+def bounds(space: spaces.Space[Any]) -> dict[str, Any]:
+    """`low` and `high` of a continuous action space, for a `Head`."""
+    if not isinstance(space, spaces.Box):
+        return {}
+    return {"low": space.low.astype(np.float32), "high": space.high.astype(np.float32)}
+
+
+@dataclass(frozen=True)
+class TorchPolicy:
+    """Any SB3 policy, acting through torch: actors that receive one import torch by unpickling it."""
+
+    version: int
+    head: Head
+    config: LearnerConfig
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    state: Mapping[str, NDArray[Any]]
+    statistics: Statistics
+
+    def outputs(self, observations: Observations) -> Array:
+        """See `policy.Policy`."""
+        network: Any = _network(self)
+        with torch.no_grad():
+            inputs = _tensors(self.statistics.scaled(observations))
+            if self.config.kind == "dqn":
+                outputs = network.q_net(inputs)
+            elif self.config.kind == "sac":
+                mean, log_std, _ = network.actor.get_action_dist_params(inputs)
+                outputs = torch.cat([mean, log_std], dim=1)
+            elif self.config.kind == "td3":
+                actor = network.actor
+                outputs = actor.mu[:-1](actor.extract_features(inputs, actor.features_extractor))
+            else:
+                distribution = network.get_distribution(inputs).distribution
+                outputs = distribution.logits if self.head.kind == "categorical" else distribution.mean
+        array: Array = outputs.numpy()
+        return array
+
+    def values(self, observations: Observations) -> NDArray[np.float64]:
+        """See `policy.Policy`."""
+        network: Any = _network(self)
+        with torch.no_grad():
+            inputs = _tensors(self.statistics.scaled(observations))
+            if isinstance(network, ActorCriticPolicy):
+                values = network.predict_values(inputs)[:, 0]
+            elif self.config.kind == "dqn":
+                values = network.q_net(inputs).max(dim=1).values
+            else:
+                best = torch.as_tensor(self.head.best(self.outputs(observations)))
+                values = torch.cat(network.critic(inputs, best), dim=1).min(dim=1).values
+        return values.numpy().astype(np.float64) * self.statistics.reward_std
+
+
+def torch_policy(
+    config: LearnerConfig, model: BaseAlgorithm, version: int, statistics: Statistics, head: Head
+) -> TorchPolicy:
+    """A copy of a model's policy."""
+    state = {
+        name: tensor.detach().numpy().copy()
+        for name, tensor in model.policy.state_dict().items()
+        if "_target." not in name
+    }
+    return TorchPolicy(version, head, config, model.observation_space, model.action_space, state, statistics)
+
+
+_BUILT: dict[str, tuple[Mapping[str, Any], BasePolicy]] = {}  # by what it is made of: the last state, and the network
+
+
+def _network(policy: TorchPolicy) -> BasePolicy:
+    """SB3's policy object with these weights; built once per process."""
+    key = f"{policy.config.model_dump_json()} {policy.observation_space} {policy.action_space}"
+    if key not in _BUILT:
+        torch.set_num_threads(1)
+        found = policy_class(policy.config)
+        made = ALGORITHMS[policy.config.kind].policy_aliases[found] if isinstance(found, str) else found
+        network = made(policy.observation_space, policy.action_space, lambda _: 0.0, **policy_kwargs(policy.config))
+        network.set_training_mode(False)
+        _BUILT[key] = ({}, network)
+    loaded, network = _BUILT[key]
+    if loaded is not policy.state:
+        state = {name: torch.as_tensor(array.copy()) for name, array in policy.state.items()}
+        missing, unexpected = network.load_state_dict(state, strict=False)
+        if unexpected or not all("_target." in name for name in missing):  # targets neither act nor score
+            raise RuntimeError(f"the policy sent to this actor is another one: {[*missing, *unexpected][:5]}")
+        _BUILT[key] = (policy.state, network)
+    return network
+
+
+def _tensors(observations: Observations) -> Any:
+    if isinstance(observations, dict):
+        return {name: torch.as_tensor(np.ascontiguousarray(array)) for name, array in observations.items()}
+    return torch.as_tensor(np.ascontiguousarray(observations))

@@ -1,0 +1,137 @@
+"""PPO, TRPO and A2C: one round is one rollout buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from space_dist.config import A2CConfig, PPOConfig, TRPOConfig
+from space_dist.envs import Observations
+from space_dist.envs.observations import concatenate, each, put, rows
+from space_dist.learner.interface import Learner, schedule, tensors
+from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs
+from space_dist.policy import Head, MlpPolicy, Statistics
+from space_dist.rollout import Shard
+
+_OURS = {
+    "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation", "log_std_init",
+    "normalize_observations", "normalize_rewards",
+}  # fmt: skip
+
+
+class OnPolicyLearner(Learner):
+    """A learner whose advantages, returns and losses are SB3's own, on our shards."""
+
+    model: OnPolicyAlgorithm
+
+    def __init__(
+        self,
+        config: PPOConfig | TRPOConfig | A2CConfig,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        *,
+        seed: int,
+        n_slots: int,
+        slot_length: int,
+        total_steps: int,
+    ) -> None:
+        self._n_slots, self._slot_length = n_slots, slot_length
+        self._settings = config
+        super().__init__(config, observation_space, action_space, seed=seed, total_steps=total_steps)
+
+    def _build(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> OnPolicyAlgorithm:
+        config = self._settings
+        settings = {name: value for name, value in dict(config).items() if name not in _OURS}
+        if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
+            settings["max_grad_norm"] = float("inf")
+        model: Any = ALGORITHMS[config.kind](
+            policy_class(config),
+            env=None,
+            n_steps=self._slot_length,
+            learning_rate=schedule(config.learning_rate, config.learning_rate_schedule),
+            policy_kwargs=policy_kwargs(config),
+            device="cpu",
+            _init_setup_model=False,
+            **settings,
+        )
+        model.observation_space, model.action_space, model.n_envs = observation_space, action_space, self._n_slots
+        model._setup_model()
+        on_policy: OnPolicyAlgorithm = model
+        return on_policy
+
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {"policy": self.model.policy.optimizer}
+
+    def _head(self) -> Head:
+        state = self.model.policy.state_dict()
+        if "log_std" in state:
+            return Head("gaussian", state["log_std"].numpy().copy(), **bounds(self.model.action_space))
+        return Head("categorical")
+
+    def _mlp(self, version: int, statistics: Statistics) -> MlpPolicy:
+        state = self.model.policy.state_dict()
+        return MlpPolicy(
+            version=version,
+            activation=self._settings.activation,
+            head=self._head(),
+            actor=layers(state, "mlp_extractor.policy_net", "action_net"),
+            critics=(layers(state, "mlp_extractor.value_net", "value_net"),),
+            statistics=statistics,
+        )
+
+    def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
+        self.fill(shards)
+        self.model.num_timesteps = steps
+        self.model._update_current_progress_remaining(steps, self._total_steps)
+        self.model.train()
+
+    def fill(self, shards: Sequence[Shard]) -> RolloutBuffer:
+        """Fill SB3's rollout buffer: values and log-probabilities by its policy, returns and advantages by its buffer.
+
+        As in SB3's own collecting, the value behind a truncated step is added to its reward, and an episode still
+        running at the end is bootstrapped from the value of its last observation.
+        """
+        policy, buffer, statistics = self.model.policy, self.model.rollout_buffer, self.statistics
+        observations = statistics.scaled(concatenate([shard.observations for shard in shards], axis=1))
+        actions = np.concatenate([shard.actions for shard in shards], axis=1)
+        rewards = np.concatenate([shard.rewards for shard in shards], axis=1)
+        rewards = self._normaliser.normalize_reward(rewards) if self._normaliser else rewards.astype(np.float32)
+        truncated = np.concatenate([shard.truncated for shard in shards], axis=1)
+        ended = np.concatenate([shard.terminated for shard in shards], axis=1) | truncated
+        length, n_slots = rewards.shape
+        with torch.no_grad():
+            flat = each(lambda array: array.reshape(length * n_slots, *array.shape[2:]), observations)
+            flat_actions = torch.as_tensor(actions.reshape(length * n_slots, -1).astype(np.float32))
+            if isinstance(self.model.action_space, spaces.Discrete):
+                flat_actions = flat_actions.long().flatten()
+            values, log_probs, _ = policy.evaluate_actions(tensors(flat), flat_actions)
+            first = 0
+            for shard in shards:
+                if rows(shard.truncated_observations):
+                    behind = self._values(shard.truncated_observations)[:, 0]
+                    mine = np.argwhere(shard.truncated)
+                    rewards[mine[:, 0], mine[:, 1] + first] += self.model.gamma * behind
+                first += shard.rewards.shape[1]
+            last_values = torch.as_tensor(self._values(concatenate([shard.last_observations for shard in shards])))
+        buffer.reset()
+        put(buffer.observations, slice(None), observations)
+        buffer.actions[:] = actions.reshape(buffer.actions.shape)
+        buffer.rewards[:] = rewards
+        buffer.episode_starts[:] = np.concatenate([np.ones((1, n_slots), dtype=np.bool_), ended[:-1]])
+        buffer.values[:] = values.numpy().reshape(length, n_slots)
+        buffer.log_probs[:] = log_probs.numpy().reshape(length, n_slots)
+        buffer.pos, buffer.full = length, True
+        buffer.compute_returns_and_advantage(last_values=last_values, dones=ended[-1])
+        return buffer
+
+    def _values(self, observations: Observations) -> NDArray[np.float32]:
+        scaled = self.statistics.scaled(observations)
+        values: NDArray[np.float32] = self.model.policy.predict_values(tensors(scaled)).numpy()
+        return values

@@ -1,0 +1,306 @@
+"""Policies as actors see them: act on observations, and say what a state is worth. NumPy only.
+
+The multilayer perceptrons of Stable-Baselines3's learners are evaluated here without torch. Anything else (CNNs,
+dictionary observations, a user's own policy) comes from `learner` as another `Policy`, which acts through torch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from space_dist.envs import Observations
+from space_dist.envs.observations import rows
+
+Array = NDArray[np.float32]
+Actions = NDArray[Any]
+Layers = tuple[tuple[Array, Array], ...]
+Activation = Literal["tanh", "relu"]
+
+LOG_STD_RANGE = (-20.0, 2.0)  # of SAC's actor; stable_baselines3/sac/policies.py
+OBSERVATION_CLIP = 10.0  # of normalised observations; SB3's VecNormalize
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """What an off-policy learner does to its actions while it collects, as a function of the environment step.
+
+    learning_starts: before this step, actions are uniformly random.
+    epsilon_initial, epsilon_final, decay_steps: of epsilon-greedy: linear in the step, as SB3's schedule.
+    noise_std: of Gaussian noise on actions scaled to [-1, 1] (TD3).
+    """
+
+    learning_starts: int = 0
+    epsilon_initial: float = 0.0
+    epsilon_final: float = 0.0
+    decay_steps: float = 1.0
+    noise_std: float = 0.0
+
+    def epsilon(self, steps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The probability of a random action at each step."""
+        share = np.minimum(steps / self.decay_steps, 1.0) if self.decay_steps > 0 else np.ones(len(steps))
+        return self.epsilon_initial + share * (self.epsilon_final - self.epsilon_initial)
+
+
+@dataclass(frozen=True)
+class Head:
+    """How a network's outputs become actions.
+
+    kind: gaussian (mean; `log_std` apart), categorical (logits), greedy (values of actions), squashed (mean and log
+        std of a Gaussian before tanh), deterministic (before tanh).
+    low, high: (action_dim,) bounds of a continuous action space.
+    """
+
+    kind: Literal["gaussian", "categorical", "greedy", "squashed", "deterministic"]
+    log_std: Array | None = None
+    low: Array | None = None
+    high: Array | None = None
+    exploration: Exploration = Exploration()
+
+    def best(self, outputs: Array) -> Actions:
+        """The most likely or most valuable actions, as a replay or rollout buffer stores them: `(n, ...)`."""
+        best: Actions = outputs
+        if self.kind in ("categorical", "greedy"):
+            best = np.argmax(outputs, axis=1)
+        elif self.kind != "gaussian":
+            best = np.tanh(outputs if self.kind == "deterministic" else np.split(outputs, 2, axis=1)[0])
+        return best
+
+    def sampled(self, outputs: Array, noise: Noise, time: int, steps: NDArray[np.int64]) -> Actions:
+        """Exploring actions, as a buffer stores them. steps: (n,) the environment step of each transition."""
+        drawn = noise.drawn[time]
+        sampled: Actions = outputs
+        if self.kind == "gaussian" and self.log_std is not None:
+            sampled = outputs + np.exp(self.log_std) * drawn
+        elif self.kind == "categorical":
+            sampled = np.argmax(outputs + drawn, axis=1)
+        else:
+            early = steps < self.exploration.learning_starts
+            uniform = noise.uniform[time]
+            if self.kind == "greedy":
+                count = outputs.shape[1]
+                explore = early | (uniform[:, 0] < self.exploration.epsilon(steps))
+                random = np.minimum((uniform[:, 1] * count).astype(np.int64), count - 1)
+                sampled = np.where(explore, random, np.argmax(outputs, axis=1))
+            elif self.kind == "squashed":
+                mean, log_std = np.split(outputs, 2, axis=1)
+                acting = np.tanh(mean + np.exp(np.clip(log_std, *LOG_STD_RANGE)) * drawn)
+                sampled = np.where(early[:, None], 2.0 * uniform - 1.0, acting).astype(np.float32)
+            else:
+                acting = np.clip(np.tanh(outputs) + np.float32(self.exploration.noise_std) * drawn, -1.0, 1.0)
+                sampled = np.where(early[:, None], 2.0 * uniform - 1.0, acting).astype(np.float32)
+        return sampled
+
+    def executed(self, actions: Actions) -> Actions:
+        """What the environment is given for stored actions: clipped (SB3's PPO) or scaled to the bounds (SB3's SAC)."""
+        if self.low is None or self.high is None:
+            return actions
+        continuous: Actions = actions.astype(np.float32, copy=False)
+        if self.kind == "gaussian":
+            clipped: Actions = np.clip(continuous, self.low, self.high)
+            return clipped
+        scaled: Actions = self.low + np.float32(0.5) * (continuous + np.float32(1.0)) * (self.high - self.low)
+        return scaled
+
+
+@dataclass(frozen=True)
+class Noise:
+    """All random numbers a shard acts with, drawn at once: (length, slots, ...) each."""
+
+    drawn: Array
+    uniform: Array
+
+    @classmethod
+    def draw(cls, head: Head, space: spaces.Space[Any], random: np.random.Generator, shape: tuple[int, int]) -> Noise:
+        """`head`'s numbers for actions of `space`."""
+        nothing = np.zeros((shape[0], 0), dtype=np.float32)
+        if head.kind == "categorical" and isinstance(space, spaces.Discrete):
+            return cls(random.gumbel(size=(*shape, int(space.n))).astype(np.float32), nothing)
+        if head.kind == "greedy":
+            return cls(nothing, random.random(size=(*shape, 2), dtype=np.float32))
+        drawn = random.standard_normal(size=(*shape, *(space.shape or ())), dtype=np.float32)
+        if head.kind == "gaussian":
+            return cls(drawn, nothing)
+        return cls(drawn, random.random(size=drawn.shape, dtype=np.float32))
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Scales of observations and rewards, as of one version of the weights; None where nothing is normalised.
+
+    mean, std: (obs_dim,) of observations.  reward_std: of discounted returns, by which rewards were divided.
+    """
+
+    mean: NDArray[np.float64] | None = None
+    std: NDArray[np.float64] | None = None
+    reward_std: float = 1.0
+
+    def scaled(self, observations: Observations) -> Observations:
+        """Normalised observations, clipped as SB3's VecNormalize does."""
+        if self.mean is None or self.std is None or isinstance(observations, dict):
+            return observations
+        scaled = (observations - self.mean) / self.std
+        return np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP).astype(np.float32)
+
+
+class Policy(Protocol):
+    """A policy and its value function as of one update."""
+
+    @property
+    def version(self) -> int:
+        """How many updates made it."""
+
+    @property
+    def head(self) -> Head:
+        """How outputs become actions."""
+
+    def outputs(self, observations: Observations) -> Array:
+        """`(n, obs_dim) -> (n, n_outputs)` for the head."""
+
+    def values(self, observations: Observations) -> NDArray[np.float64]:
+        """`(n, obs_dim) -> (n,)` what the states are worth, in unscaled reward units."""
+
+
+@dataclass(frozen=True)
+class MlpPolicy:
+    """Multilayer perceptrons.
+
+    actor: layers of (weights (n_in, n_out), biases (n_out,)).
+    critics: V(s), one network; or Q(s, a), one or more, whose least counts; none for a greedy policy, whose actor is Q.
+    """
+
+    version: int
+    activation: Activation
+    head: Head
+    actor: Layers
+    critics: tuple[Layers, ...]
+    critics_take_actions: bool = False
+    statistics: Statistics = Statistics()
+
+    def outputs(self, observations: Observations) -> Array:
+        """See `Policy`."""
+        return forward(self.actor, self.activation, _flat(self.statistics.scaled(observations)))
+
+    def values(self, observations: Observations) -> NDArray[np.float64]:
+        """See `Policy`: V(s), max_a Q(s, a), or min_k Q_k(s, pi(s))."""
+        scaled = _flat(self.statistics.scaled(observations))
+        if self.head.kind == "greedy":
+            values = forward(self.actor, self.activation, scaled).max(axis=1)
+        else:
+            inputs = scaled
+            if self.critics_take_actions:
+                best = self.head.best(forward(self.actor, self.activation, scaled)).astype(np.float32)
+                inputs = np.concatenate([scaled, best], axis=1)
+            values = forward(self.critics[0], self.activation, inputs)[:, 0]
+            for critic in self.critics[1:]:
+                values = np.minimum(values, forward(critic, self.activation, inputs)[:, 0])
+        scaled_values: NDArray[np.float64] = values.astype(np.float64) * self.statistics.reward_std
+        return scaled_values
+
+
+@dataclass(frozen=True)
+class BlindPolicy:
+    """Actions that ignore the observation: what the first scales of observations and rewards are measured with."""
+
+    version: int
+    head: Head
+    n_outputs: int
+
+    def outputs(self, observations: Observations) -> Array:
+        """See `Policy`: always 0."""
+        return np.zeros((rows(observations), self.n_outputs), dtype=np.float32)
+
+    def values(self, observations: Observations) -> NDArray[np.float64]:
+        """See `Policy`: unknown, so 0."""
+        return np.zeros(rows(observations))
+
+
+def blind(policy: Policy, action_space: spaces.Space[Any], version: int) -> BlindPolicy:
+    """A policy with `policy`'s head that sees nothing; off-policy heads act uniformly at random."""
+    head = dataclasses.replace(policy.head, exploration=Exploration(learning_starts=1 << 62))
+    if isinstance(action_space, spaces.Discrete):
+        return BlindPolicy(version, head, int(action_space.n))
+    n_actions = int(np.prod(action_space.shape or ()))
+    return BlindPolicy(version, head, 2 * n_actions if head.kind == "squashed" else n_actions)
+
+
+def forward(layers: Layers, activation: Activation, inputs: Array) -> Array:
+    """`(n, n_in) -> (n, n_out)`; the last layer is linear."""
+    for weights, biases in layers[:-1]:
+        inputs = inputs @ weights
+        inputs += biases
+        if activation == "tanh":
+            np.tanh(inputs, out=inputs)
+        else:
+            np.maximum(inputs, 0.0, out=inputs)
+    weights, biases = layers[-1]
+    return inputs @ weights + biases
+
+
+def _flat(observations: Observations) -> Array:
+    if isinstance(observations, dict):
+        raise TypeError("a multilayer perceptron takes flat observations")
+    return observations.astype(np.float32, copy=False)
+
+
+def to_arrays(policy: MlpPolicy) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """A policy as arrays and a description, for `model.npz` and `model.json`: usable without this package."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for part, layers in _parts(policy):
+        for index, (matrix, bias) in enumerate(layers):
+            arrays |= {f"{part}.{index}.weight": matrix, f"{part}.{index}.bias": bias}
+    head, statistics = policy.head, policy.statistics
+    optional = {
+        "log_std": head.log_std, "action_low": head.low, "action_high": head.high,
+        "observation_mean": statistics.mean, "observation_std": statistics.std,
+    }  # fmt: skip
+    arrays |= {name: array for name, array in optional.items() if array is not None}
+    return arrays, {
+        "format": 2,
+        "version": policy.version,
+        "activation": policy.activation,
+        "policy": head.kind,
+        "critics": len(policy.critics),
+        "critics_take_actions": policy.critics_take_actions,
+        "reward_std": statistics.reward_std,
+        "formula": "x = activation(x @ weight + bias) per layer; the last layer is linear",
+        "shapes": {name: list(array.shape) for name, array in arrays.items()},
+    }
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]], description: Mapping[str, Any]) -> MlpPolicy:
+    """The inverse of `to_arrays`, less exploration. Raises KeyError or ValueError for anything else."""
+    if description["format"] != 2 or description["activation"] not in ("tanh", "relu"):
+        raise ValueError("not a model description of format 2")
+    kinds = ("gaussian", "categorical", "greedy", "squashed", "deterministic")
+    if description["policy"] not in kinds or not math.isfinite(description["reward_std"]):
+        raise ValueError("not a policy this version knows")
+
+    def layers(part: str) -> Layers:
+        count = sum(name.startswith(f"{part}.") for name in arrays) // 2
+        return tuple((arrays[f"{part}.{index}.weight"], arrays[f"{part}.{index}.bias"]) for index in range(count))
+
+    return MlpPolicy(
+        version=int(description["version"]),
+        activation=description["activation"],
+        head=Head(
+            description["policy"], arrays.get("log_std"), arrays.get("action_low"), arrays.get("action_high")
+        ),
+        actor=layers("actor"),
+        critics=tuple(layers(f"critic{index}") for index in range(int(description["critics"]))),
+        critics_take_actions=bool(description["critics_take_actions"]),
+        statistics=Statistics(
+            arrays.get("observation_mean"), arrays.get("observation_std"), float(description["reward_std"])
+        ),
+    )  # fmt: skip
+
+
+def _parts(policy: MlpPolicy) -> list[tuple[str, Layers]]:
+    return [("actor", policy.actor), *((f"critic{index}", layers) for index, layers in enumerate(policy.critics))]
