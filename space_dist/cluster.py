@@ -45,7 +45,7 @@ class Cluster(Protocol):
     def start_values(self, policy: Handle) -> list[Handle]:
         """One array per chunk of the training instances."""
 
-    def evaluate(self, policy: Handle, split: Split) -> list[Handle]:
+    def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """One `Outcomes` per part."""
 
     def begin(self, values: Sequence[Handle]) -> Decision:
@@ -87,7 +87,7 @@ class Central:
         if state.version != version:
             raise RuntimeError(f"asked to go on from selection {version} with the state of {state.version}")
         after = checked(np.concatenate(chunks[:n_after]), "start values")
-        if len(chunks) > n_after:
+        if len(chunks) > n_after and not (self._from_zero and version == 0):
             before = checked(np.concatenate(chunks[n_after:]), "start values")
         new, selection, numbers = self._curriculum.step(state, Feedback(version, before, after, gradient_steps))
         return new, selection, numbers, after
@@ -116,9 +116,10 @@ class InProcess:
         """See `Cluster`."""
         return [self._worker.start_values(policy, chunk) for chunk in range(self._setup.chunks)]
 
-    def evaluate(self, policy: Handle, split: Split) -> list[Handle]:
+    def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """See `Cluster`."""
-        return [self._worker.evaluate(policy, split, part) for part in range(self._setup.evaluation_parts)]
+        parts = range(self._setup.evaluation_parts)
+        return [self._worker.evaluate(policy, split, part, stochastic=stochastic) for part in parts]
 
     def begin(self, values: Sequence[Handle]) -> Decision:
         """See `Cluster`."""

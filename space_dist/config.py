@@ -319,6 +319,8 @@ class DQNConfig(_OffPolicy):
     """Probability of a random action in the end. Source: SB3."""
     max_grad_norm: float | None = Field(default=10.0, gt=0.0)
     """Largest norm of the gradient; null: no clipping. Source: SB3."""
+    scored_network: Literal["online", "target"] = "online"
+    """The network whose max_a Q is an instance's start value. Source: ours; the paper's notebook scores the target."""
 
 
 class SACConfig(_OffPolicy):
@@ -398,6 +400,8 @@ class EvaluationConfig(_Section):
     """Environment steps between evaluations; log: at 1e3, 3e3, 1e4, 3e4, ... Step 0 and the end are evaluated too."""
     episodes: int = Field(default=1, ge=1, le=1000)
     """Episodes per instance and evaluation, with the same seeds each time."""
+    legacy_metric: bool = False
+    """Also report `legacy_return`: stochastic policy, sum of r_t * gamma^(T-1-t). Source: the released code's plots."""
 
     @field_validator("every_steps")
     @classmethod

@@ -139,10 +139,10 @@ class RayCluster:
         """See `cluster.Cluster`."""
         return [self._ask(chunk, "start_values", policy, chunk)[0] for chunk in range(self._setup.chunks)]
 
-    def evaluate(self, policy: Handle, split: Split) -> list[Handle]:
+    def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """See `cluster.Cluster`."""
         parts = range(self._setup.evaluation_parts)
-        return [self._ask(part, "evaluate", policy, split, part)[0] for part in parts]
+        return [self._ask(part, "evaluate", policy, split, part, stochastic=stochastic)[0] for part in parts]
 
     def begin(self, values: Sequence[Handle]) -> Decision:
         """See `cluster.Cluster`."""

@@ -173,7 +173,8 @@ class MlpPolicy:
     """Multilayer perceptrons.
 
     actor: layers of (weights (n_in, n_out), biases (n_out,)).
-    critics: V(s), one network; or Q(s, a), one or more, whose least counts; none for a greedy policy, whose actor is Q.
+    critics: V(s), one network; or Q(s, a), one or more, whose least counts. A greedy policy's actor is Q itself; a
+        critic, if there is one, is the network that scores in its stead.
     """
 
     version: int
@@ -192,7 +193,8 @@ class MlpPolicy:
         """See `Policy`: V(s), max_a Q(s, a), or min_k Q_k(s, pi(s))."""
         scaled = _flat(self.statistics.scaled(observations))
         if self.head.kind == "greedy":
-            values = forward(self.actor, self.activation, scaled).max(axis=1)
+            scoring = self.critics[0] if self.critics else self.actor
+            values = forward(scoring, self.activation, scaled).max(axis=1)
         else:
             inputs = scaled
             if self.critics_take_actions:

@@ -91,6 +91,7 @@ class Outcomes:
     """Evaluation episodes, one entry per instance and episode, instances in id order.
 
     returns, discounted_returns (n,) in reward units; lengths (n,) in steps; success (n,) as in `Episodes`.
+    backward_discounted_returns: (n,) sum of r_t gamma^(T-1-t), the released SPaCE code's metric.
     """
 
     policy_version: int
@@ -98,6 +99,7 @@ class Outcomes:
     discounted_returns: FloatArray
     lengths: IntArray
     success: FloatArray
+    backward_discounted_returns: FloatArray
 
 
 @dataclass(frozen=True)
@@ -200,8 +202,8 @@ class Worker:
         means: FloatArray = np.concatenate(blocks).reshape(-1, self._setup.start_states).mean(axis=1)
         return means
 
-    def evaluate(self, policy: Policy, split: Split, part: int) -> Outcomes:
-        """Deterministic episodes on one part of a split."""
+    def evaluate(self, policy: Policy, split: Split, part: int, *, stochastic: bool = False) -> Outcomes:
+        """Episodes on one part of a split: deterministic ones, or `stochastic` ones for the released code's metric."""
         setup, instances = self._setup, self._setup.instances(split)
         episodes = setup.evaluation_episodes
         seeds = episode_seeds(
@@ -211,10 +213,15 @@ class Worker:
         mine = np.array_split(np.arange(len(seeds)), setup.evaluation_parts)[part]
         if not len(mine):
             nothing = np.zeros(0)
-            return Outcomes(policy.version, nothing, nothing, nothing.astype(np.int64), nothing)
+            return Outcomes(policy.version, nothing, nothing, nothing.astype(np.int64), nothing, nothing)
         if len(mine) not in self._evaluating:
             self._evaluating[len(mine)] = setup.make_env(len(mine))
-        return evaluate(self._evaluating[len(mine)], policy, contexts[mine], seeds[mine], gamma=setup.gamma)
+        env = self._evaluating[len(mine)]
+        noise = None
+        if stochastic:
+            random = generator(setup.seed, Purpose.EVALUATION, 2 if split == "train" else 3, part)
+            noise = Noise.draw(policy.head, env.action_space, random, (env.horizon, env.n_slots))
+        return evaluate(env, policy, contexts[mine], seeds[mine], gamma=setup.gamma, noise=noise)
 
 
 def collect(
@@ -276,17 +283,23 @@ def collect(
 
 
 def evaluate(
-    env: BatchedEnv, policy: Policy, contexts: FloatArray, seeds: NDArray[np.uint64], *, gamma: float
-) -> Outcomes:
-    """One deterministic episode per row of `contexts` (n_slots, d), all at once."""
+    env: BatchedEnv, policy: Policy, contexts: FloatArray, seeds: NDArray[np.uint64],
+    *, gamma: float, noise: Noise | None = None,
+) -> Outcomes:  # fmt: skip
+    """One episode per row of `contexts` (n_slots, d), at once; deterministic unless there is `noise` to act with."""
     slots = np.arange(env.n_slots)
     observations = take(env.reset(slots, contexts, seeds), slice(None))
     alive = np.ones(env.n_slots, dtype=np.bool_)
     returns, discounted, success = np.zeros(env.n_slots), np.zeros(env.n_slots), np.full(env.n_slots, np.nan)
-    lengths = np.zeros(env.n_slots, dtype=np.int64)
-    discount = 1.0
+    lengths, backward = np.zeros(env.n_slots, dtype=np.int64), np.zeros(env.n_slots)
+    discount, time = 1.0, 0
+    trained = np.full(env.n_slots, np.iinfo(np.int64).max)  # behind every warm-up and schedule of exploration
     while alive.any():
-        step = env.step(policy.head.executed(policy.head.best(policy.outputs(observations))))
+        outputs = policy.outputs(observations)
+        chosen = policy.head.best(outputs) if noise is None else policy.head.sampled(outputs, noise, time, trained)
+        step = env.step(policy.head.executed(chosen))
+        backward = np.where(alive, gamma * backward + step.rewards, backward)
+        time += 1
         returns += np.where(alive, step.rewards, 0.0)
         discounted += np.where(alive, discount * step.rewards, 0.0)
         lengths += alive
@@ -298,7 +311,7 @@ def evaluate(
         put(observations, slice(None), step.observations)
         if len(ended) and alive.any():  # every slot must be steppable; what follows in these is not counted
             put(observations, ended, env.reset(ended, contexts[ended], seeds[ended]))
-    return Outcomes(policy.version, returns, discounted, lengths, success)
+    return Outcomes(policy.version, returns, discounted, lengths, success, backward)
 
 
 def start_observations(setup: Setup, chunk: int) -> Observations:

@@ -41,6 +41,7 @@ from space_dist.rollout import (
     Outcomes,
     Setup,
     Shard,
+    Split,
     Walk,
     joined,
 )
@@ -275,18 +276,27 @@ class Training:
 
     def _evaluate(self, policy: Handle) -> None:
         run, cluster = self._run, self._cluster
-        train, test = cluster.evaluate(policy, "train"), cluster.evaluate(policy, "test")
+        settings = self._config.evaluation
         row: Row = {"kind": "evaluation", **self._position()}
+        splits: tuple[Split, ...] = ("train", "test")
+        asked = {split: cluster.evaluate(policy, split) for split in splits}
+        legacy = {split: cluster.evaluate(policy, split, stochastic=True) for split in splits if settings.legacy_metric}
+        handles = [*asked["train"], *asked["test"], *(handle for split in legacy for handle in legacy[split])]
 
         def settle(answers: list[Any]) -> None:
-            outcomes = {"train": answers[: len(train)], "test": answers[len(train) :]}
-            for split, parts in outcomes.items():
-                row[split] = _summary(joined(parts), self._config.evaluation.episodes)
+            arrived = iter(answers)
+            for split in splits:
+                outcomes = joined([next(arrived) for _ in asked[split]])
+                row[split] = _summary(outcomes, settings.episodes)
+            for split in legacy:
+                outcomes = joined([next(arrived) for _ in legacy[split]])
+                returns = checked(outcomes.backward_discounted_returns, "returns")
+                row[split]["legacy_return"] = float(returns.mean())
             self._append(row)
             self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
             log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
 
-        run.pending.append(_Pending([*train, *test], settle))
+        run.pending.append(_Pending(handles, settle))
         run.evaluated_at = run.steps
 
     def _account(self, shards: list[Shard], update: Update) -> None:

@@ -170,8 +170,13 @@ def test_v0_zero_makes_the_first_changes_the_values_themselves():
         central = Central(config_with(f"{{kind: space, eta: 0.125, v0: {v0}}}"), make_set(4))
         *_, values = central.begin(first[:3], first[3:])
         assert values.tolist() == (first.tolist() if v0 == "network" else [0.0] * 4)
-        _, selection, numbers, after = central.decide(start, values, 0, 1, second)
+        new, selection, numbers, after = central.decide(start, values, 0, 1, 1, second)
         assert (numbers["grew"], selection.ids.tolist(), after.tolist()) == (grew, ids, second.tolist())
+        # Rescored under new scales, the values before are new ones; zeros stay zeros.
+        _, selection, numbers, _ = central.decide(start, values, 0, 1, 1, second, first + 0.25)
+        assert numbers["mean_value_before"] == (8.25 if v0 == "network" else 0)
+        _, _, numbers, _ = central.decide(new, after, 1, 1, 1, second, np.array([1.0, 2.0, 3.0, 4.0]))
+        assert numbers["mean_value_before"] == np.mean([(1.0, 2.0, 3.0, 4.0)[i - 1] for i in ids])
 
 
 # ---- Line 8: how the set grows -------------------------------------------------------------------
@@ -226,11 +231,16 @@ def test_trace_adaptive_eta():
 def test_a_raised_eta_grows_the_set_also_where_its_formula_would_not():
     # eta = 2, V_{t-1} = 0, dV = 1e-7 > 2e-8. The formula gives (1e-7 + 1e-3) / 1e-3 = 1.0001, which raises nothing and
     # times the floor 1e-8 is no 1e-7 either. Yet the set grows, and eta is not lowered.
-    values = [(0, 0, 0, 0), (1e-7, 0, 0, 0), (0, 0, 0, 0)]
+    values = [(0, 0, 0, 0), (1e-7, 0, 0, 0), (0, 0, 0, 0), (1e-7, 0, 0, 0)]
     for mode in ("once", "persistent"):
         curriculum = space(eta=2.0, adaptive_eta=mode, patience=1, rank=variants.near_centroid(np.eye(4)))
-        decided = follow(curriculum, [1], values)
-        assert [(grew, numbers["eta"]) for _, grew, numbers, _ in decided] == [(False, 2.0), (True, 2.0)]
+        decided = follow(curriculum, [1], values, steps=[1, 0, 1])
+        assert [(grew, numbers["eta"]) for _, grew, numbers, _ in decided] == [
+            (False, 2.0), (False, None), (True, 2.0),
+        ]  # fmt: skip
+    # V_{t-1} = 0.25 is less than epsilon = 0.5: (1.75 + 0.5) / 0.5, not / 0.25.
+    decided = follow(space(adaptive_eta="once", patience=1, epsilon=0.5), [1], [[0.5] * 4, [0.25] * 4, [2.0] * 4])
+    assert [(grew, numbers["eta"]) for _, grew, numbers, _ in decided] == [(False, 0.125), (True, 4.5)]
     # An eta beyond all floats is the largest one: it must be storable.
     decided = follow(space(adaptive_eta="persistent", patience=1), [1], [[1e308] * 4, [0.0] * 4, [1e308] * 4])
     assert [(grew, numbers["eta"]) for _, grew, numbers, _ in decided] == [(False, 0.125), (True, sys.float_info.max)]
@@ -309,6 +319,11 @@ def test_trace_cspace_on_a_schedule():
         ([1, 2], True), ([1, 2], False), ([1, 2, 3], True), ([1, 2, 3, 4], True), ([1, 2, 3, 4], False),
     ]  # fmt: skip
     assert decided[2][0][2] == 3  # nearest first
+    # Euclidean: from (0, 0), (3, 4) / 8 is 0.625 away, though by the sum of its sides 0.875.
+    sides = np.array([(0.0, 0.0), (0.375, 0.5), (0.75, 0.0), (1.0, 1.0)])
+    for rank in (variants.near_centroid(sides), variants.near_member(sides)):
+        scores = rank(feedback(State(0, 0, 1, np.array([0])), [0] * 4, [0] * 4), np.arange(4) == 0)
+        assert scores[1:].tolist() == [-0.625, -0.75, -np.sqrt(2)]
     assert all(numbers["eta"] is None for *_, numbers, _ in decided)
     nothing = [[float("nan")] * 4] * 6
     assert [one[:2] for one in follow(curriculum, [1], nothing, steps=[1, 0, 4, 1, 1])] == [one[:2] for one in decided]
@@ -379,10 +394,9 @@ def test_distances_are_between_contexts_scaled_to_their_bounds(distance: str):
 
 def test_trace_of_a_fixed_subset():
     instances = make_set(4)
-    whole = RoundRobin(instances, seed=3).start()[1].ids.tolist()
-    for settings, chosen in (("ids: [4, 2]", {2, 4}), ("count: 3", set(whole[:3])), ("count: 4", set(whole))):
-        curriculum = make_curriculum(config_with(f"{{kind: fixed, {settings}}}", "seed=3"), instances)
-        expected = [i for i in whole if i in chosen]
+    assert RoundRobin(instances, seed=1).start()[1].ids.tolist() == [4, 3, 2, 1]
+    for settings, expected in (("ids: [2, 4]", [4, 2]), ("count: 3", [4, 3, 2]), ("count: 4", [4, 3, 2, 1])):
+        curriculum = make_curriculum(config_with(f"{{kind: fixed, {settings}}}", "seed=1"), instances)
         decided = drive(curriculum, [(1, 2, 3, 4), (5, -6, 7, -8), (9, 9, 9, 9)], gradient_steps=[1, 0])
         for t, (state, selection, _) in enumerate(decided):
             assert selection.ids.tolist() == expected
@@ -418,6 +432,25 @@ EVERY = (
     "{kind: fixed, count: 3}",
     "{kind: fixed, ids: [7, 2]}",
 )
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"eta": 0.4}, {"kappa": 2}, {"growth": "multiply", "kappa": 3}, {"mean": "as_printed"},
+        {"mean": "mean_abs_change"}, {"adaptive_eta": "once"}, {"adaptive_eta": "once", "patience": 2},
+        {"adaptive_eta": "persistent"}, {"adaptive_eta": "persistent", "epsilon": 0.25},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_each_setting_reaches_the_curriculum_and_matters(settings: dict[str, Any]):
+    values = 2 + np.sin(np.arange(60)[:, None] * (1 + np.arange(9) / 8))  # never settles for long
+    words = ", ".join(f"{key}: {value}" for key, value in settings.items())
+    config = config_with(f"{{kind: space, {words}}}")
+    found = as_plain(drive(make_curriculum(config, make_set(9)), values))
+    assert found == as_plain(drive(space(make_set(9), **{"eta": 0.1, "kappa": 1, **settings}), values))
+    fewer = dict(list(settings.items())[:-1])  # the last setting alone makes the difference
+    assert found != as_plain(drive(space(make_set(9), **{"eta": 0.1, "kappa": 1, **fewer}), values))
 
 
 @pytest.mark.parametrize("curriculum", EVERY)

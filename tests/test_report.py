@@ -268,13 +268,18 @@ def test_a_running_run_is_drawn_while_nothing_has_finished(tmp_path: Path) -> No
     assert figure.axes[0].get_lines()[0].get_label() == "space (1 seed, unfinished)"
 
 
-def test_evaluations_that_not_every_seed_has_are_left_out_and_named(tmp_path: Path) -> None:
+def test_seeds_evaluated_at_different_steps_count_with_their_last_evaluation(tmp_path: Path) -> None:
     finished_run(tmp_path / "s0", 1.0, seed=0)
     short = start_run(tmp_path / "s1", seed=1)
     continue_run(short, [-10.0, -8.0, -6.0], GROWTH[:2])
     report = build_report(find_ledgers([tmp_path]), tmp_path / "out")
     assert report.table[0]["environment steps"] == "3,000 (2,000–4,000)"
-    assert any("3 of up to 5 evaluations" in remark for remark in report.remarks)
+    assert any("evaluated at different steps" in remark for remark in report.remarks)
+    (configuration,) = group([load_run(ledger) for ledger in find_ledgers([tmp_path])])
+    steps, returns = configuration.returns("test")
+    longest = max(configuration.runs, key=lambda run: len(run.evaluation_steps))
+    assert steps.tolist() == longest.evaluation_steps.tolist()
+    assert returns[1].tolist() == [-10.0, -8.0, -6.0, -6.0, -6.0]
 
 
 def test_a_final_return_that_is_no_number_is_not_averaged_away(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 
-from space_dist.config import LearnerConfig
+from space_dist.config import DQNConfig, LearnerConfig
 from space_dist.envs import Observations
 from space_dist.errors import ConfigError
 from space_dist.policy import Array, Head, Layers, Statistics
@@ -122,7 +122,8 @@ class TorchPolicy:
             if isinstance(network, ActorCriticPolicy):
                 values = network.predict_values(inputs)[:, 0]
             elif self.config.kind == "dqn":
-                values = network.q_net(inputs).max(dim=1).values
+                target = isinstance(self.config, DQNConfig) and self.config.scored_network == "target"
+                values = (network.q_net_target if target else network.q_net)(inputs).max(dim=1).values
             else:
                 best = torch.as_tensor(self.head.best(self.outputs(observations)))
                 values = torch.cat(network.critic(inputs, best), dim=1).min(dim=1).values
@@ -136,7 +137,7 @@ def torch_policy(
     state = {
         name: tensor.detach().numpy().copy()
         for name, tensor in model.policy.state_dict().items()
-        if "_target." not in name
+        if "_target." not in name or name.startswith("q_net_target.")
     }
     return TorchPolicy(version, head, config, model.observation_space, model.action_space, state, statistics)
 

@@ -23,7 +23,8 @@ from space_dist.rollout import Shard
 
 _OURS = {
     "kind", "policy", "n_steps", "n_episodes", "learning_rate", "learning_rate_schedule", "net_arch", "activation",
-    "log_std_init", "gradient_steps_per_step", "action_noise_std", "normalize_observations", "normalize_rewards",
+    "log_std_init", "gradient_steps_per_step", "action_noise_std", "scored_network",
+    "normalize_observations", "normalize_rewards",
 }  # fmt: skip
 
 
@@ -149,9 +150,11 @@ class DQNLearner(OffPolicyLearner):
 
     def _mlp(self, version: int, statistics: Statistics) -> MlpPolicy:
         state = self.model.policy.state_dict()
+        target = isinstance(self._settings, DQNConfig) and self._settings.scored_network == "target"
         return MlpPolicy(
-            version, self._settings.activation, self._head(), layers(state, "q_net.q_net"), (), statistics=statistics
-        )
+            version, self._settings.activation, self._head(), layers(state, "q_net.q_net"),
+            critics=(layers(state, "q_net_target.q_net"),) if target else (), statistics=statistics,
+        )  # fmt: skip
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
         """As `Learner.save`."""

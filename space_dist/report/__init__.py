@@ -37,9 +37,9 @@ _METHOD = f"""\
 Final numbers are those of each finished run's evaluation at its last step; returns are undiscounted means over the
 instances. IQM: interquartile mean over seeds (below four seeds the plain mean). [95 %]: percentile bootstrap over
 seeds, {RESAMPLES:,} resamples; with few seeds it is narrower than it should be, and a single seed has none. Curves show
-finished runs (while there is none, unfinished ones) at steps where every drawn seed was evaluated; bands are the same
-intervals. Steps are real environment steps of training. "All instances reached": finished runs that were trained on
-all their instances at once, and from which step on (median over those)."""
+finished runs (while there is none, unfinished ones); where seeds were evaluated at different steps, each counts with
+its last evaluation. Bands are the same intervals. Steps are real environment steps of training. "All instances
+reached": finished runs that were trained on all their instances at once, and from which step on (median over those)."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ _DPI: Final = 150
 def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
     """Test returns, train returns and set sizes over real environment steps, one colour for each configuration.
 
-    Returns are IQMs over seeds with 95 % bootstrap bands, at the steps where every drawn seed was evaluated. Sizes are
+    Returns are IQMs over seeds with 95 % bootstrap bands, at the steps where any drawn seed was evaluated. Sizes are
     medians over seeds as far as all drawn seeds got, with a thin line for each seed.
     """
     figure = _figure(15.0, 4.6 + 0.25 * ((len(configurations) - 1) // 3))

@@ -102,12 +102,21 @@ class Configuration:
         return tuple(run for run in self.finished or self.runs if len(run.evaluation_steps))
 
     def returns(self, split: Split) -> tuple[IntArray, FloatArray]:
-        """`(k,)` real steps at which every drawn run was evaluated, and its `(runs, k)` mean undiscounted returns."""
+        """`(k,)` real steps at which any drawn run was evaluated, and the `(runs, k)` mean undiscounted returns.
+
+        Rounds that end by episodes differ in steps from seed to seed: between its evaluations, and behind its end, a
+        run's last evaluation counts. Runs that have not finished are followed no further than the shortest.
+        """
         if not self.drawn:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 0))
-        steps = functools.reduce(np.intersect1d, (run.evaluation_steps for run in self.drawn))
+        steps = functools.reduce(np.union1d, (run.evaluation_steps for run in self.drawn))
+        if not self.finished:
+            steps = steps[steps <= min(run.evaluation_steps[-1] for run in self.drawn)]
+        steps = steps[steps >= max(run.evaluation_steps[0] for run in self.drawn)]
         curves = [
-            (run.test if split == "test" else run.train)["return"][np.searchsorted(run.evaluation_steps, steps)]
+            (run.test if split == "test" else run.train)["return"][
+                np.searchsorted(run.evaluation_steps, steps, side="right") - 1
+            ]
             for run in self.drawn
         ]
         return steps, np.stack(curves)

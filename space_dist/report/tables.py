@@ -75,11 +75,9 @@ def remarks(configuration: Configuration) -> list[str]:
         broken = [run for run in counted if math.isnan(run.final(split, "return"))]
         lines += [f"{label}: the final {split} return is not a finite number for {_seeds(broken)}, so there is none "
                   "over the seeds."] if broken else []  # fmt: skip
-    common = len(configuration.returns("test")[0])
-    most = max((len(run.evaluation_steps) for run in configuration.drawn), default=0)
-    if common < most:
-        lines.append(f"{label}: its curve has {common} of up to {most} evaluations, those at steps where every drawn "
-                     "seed has one.")  # fmt: skip
+    if len({tuple(run.evaluation_steps.tolist()) for run in configuration.drawn}) > 1:
+        lines.append(f"{label}: its seeds were evaluated at different steps; between its evaluations, and behind its "
+                     "end, a run's last one is drawn.")  # fmt: skip
     for field, values in fingerprint_differences(configuration.runs).items():
         lines.append(f"{label}: its runs differ in {field}: {', '.join(values)}.")
     if moved := [run for run in configuration.runs if run.status.fingerprint_changed]:
