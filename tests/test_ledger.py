@@ -46,7 +46,7 @@ from space_dist.ledger import (
 
 ROOT = Path(__file__).parent.parent
 FLIPS = (0x01, 0x20, 0x80, 0xFF)
-ROUNDS = 4
+ROUNDS = 3
 
 
 # ---- a small run -----------------------------------------------------------------------------------------------------
@@ -218,7 +218,8 @@ def test_a_damaged_last_row_is_never_taken_for_right(tmp_path: Path) -> None:
     assert Ledger(tmp_path).rows() == rows[:-1]
 
 
-def test_only_committed_rows(tmp_path: Path, no_fsync: None) -> None:
+@pytest.mark.usefixtures("no_fsync")
+def test_only_committed_rows(tmp_path: Path) -> None:
     ledger = write_run(tmp_path, 2)
     with RunWriter(ledger) as writer:
         writer.restore()
@@ -231,7 +232,8 @@ def test_only_committed_rows(tmp_path: Path, no_fsync: None) -> None:
 # ---- status.json -----------------------------------------------------------------------------------------------------
 
 
-def test_a_damaged_status_is_never_taken_for_right(tmp_path: Path, no_fsync: None) -> None:
+@pytest.mark.usefixtures("no_fsync")
+def test_a_damaged_status_is_never_taken_for_right(tmp_path: Path) -> None:
     ledger = write_run(tmp_path, 1)
     good = ledger.status_file.read_bytes()
     right = ledger.status()
@@ -246,8 +248,7 @@ def test_a_damaged_status_is_never_taken_for_right(tmp_path: Path, no_fsync: Non
             ledger.status_file.write_bytes(good)
             flip(ledger.status_file, position, mask)
             try:
-                assert repr(ledger.status()) == repr(right)  # white space for white space
-                assert good[position : position + 1].isspace()
+                assert repr(ledger.status()) == repr(right)  # other white space, or \u00FC for \u00fc
             except LedgerError:
                 refused += 1
     assert refused > 3 * len(good)
@@ -264,7 +265,8 @@ def test_anything_else_in_place_of_a_status(tmp_path: Path, content: bytes) -> N
         Ledger(tmp_path).status()
 
 
-def test_no_status_and_a_status_of_another_format(tmp_path: Path, no_fsync: None) -> None:
+@pytest.mark.usefixtures("no_fsync")
+def test_no_status_and_a_status_of_another_format(tmp_path: Path) -> None:
     with pytest.raises(LedgerError, match="holds no run"):
         Ledger(tmp_path).status()
     with RunWriter(Ledger(tmp_path)) as writer:
@@ -277,7 +279,8 @@ def test_no_status_and_a_status_of_another_format(tmp_path: Path, no_fsync: None
         Ledger(tmp_path).status()
 
 
-def test_a_new_status_keeps_what_the_commit_said(tmp_path: Path, no_fsync: None) -> None:
+@pytest.mark.usefixtures("no_fsync")
+def test_a_new_status_keeps_what_the_commit_said(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     with RunWriter(ledger) as writer:
         writer.restore()
@@ -464,7 +467,7 @@ def checkpoint_file(folder: Path, number: int) -> Path:
 
 
 @pytest.fixture
-def run(tmp_path: Path, no_fsync: None) -> Path:
+def run(tmp_path: Path, no_fsync: None) -> Path:  # noqa: ARG001 - a fixture asks for another by name
     """Committed until its last round, with rows behind it, the last of them torn."""
     ledger = write_run(tmp_path / "run")
     for name in ROW_FILES:
@@ -474,7 +477,8 @@ def run(tmp_path: Path, no_fsync: None) -> Path:
     return ledger.folder
 
 
-def test_the_two_newest_checkpoints_are_kept(tmp_path: Path, no_fsync: None) -> None:
+@pytest.mark.usefixtures("no_fsync")
+def test_the_two_newest_checkpoints_are_kept(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     with RunWriter(ledger) as writer:
         writer.restore()
@@ -667,16 +671,7 @@ def kill_everywhere(root: Path, power: bool) -> None:
         if child == 0:
             code = 3
             with contextlib.suppress(Exception):
-                told = os.open(root / f"{k}.committed", os.O_CREAT | os.O_WRONLY)
-
-                def die() -> None:
-                    if power:
-                        faults.lose_power(root / str(k))
-                    os.kill(os.getpid(), signal.SIGKILL)
-
-                faults = Faults(k, die)
-                hook(faults, pytest.MonkeyPatch())
-                write_run(root / str(k), committed=lambda number: os.pwrite(told, b"%d" % number, 0) and None)
+                run_and_die(root, k, power)
                 code = 0
             os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -684,6 +679,22 @@ def kill_everywhere(root: Path, power: bool) -> None:
             (root / "count").write_text(str(k - 1))
             return
         assert code == -signal.SIGKILL, code
+
+
+def run_and_die(root: Path, k: int, power: bool) -> None:
+    told = os.open(root / f"{k}.committed", os.O_CREAT | os.O_WRONLY)
+
+    def die() -> None:
+        if power:
+            faults.lose_power(root / str(k))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def committed(number: int) -> None:
+        os.pwrite(told, b"%d" % number, 0)
+
+    faults = Faults(k, die)
+    hook(faults, pytest.MonkeyPatch())
+    write_run(root / str(k), committed=committed)
 
 
 def assert_resumes(folder: Path, committed: int, undisturbed: dict[str, bytes]) -> None:
@@ -700,13 +711,14 @@ def assert_resumes(folder: Path, committed: int, undisturbed: dict[str, bytes]) 
         rows = ledger.rows(name)
         assert rows == all_rows(ROUNDS, name)[: len(rows)]
     assert committed <= restored(folder) <= committed + 1
-    write_run(folder)
+    write_run(folder, ROUNDS + 1)
     assert contents(folder) == undisturbed
 
 
 @pytest.fixture
-def undisturbed(tmp_path: Path, no_fsync: None) -> dict[str, bytes]:
-    return contents(write_run(tmp_path / "undisturbed").folder)
+def undisturbed(tmp_path: Path, no_fsync: None) -> dict[str, bytes]:  # noqa: ARG001 - a fixture asks for another by name
+    """What a run that was killed must have come to one round later."""
+    return contents(write_run(tmp_path / "undisturbed", ROUNDS + 1).folder)
 
 
 @pytest.mark.parametrize("power", [False, True], ids=["SIGKILL", "power cut"])
@@ -747,7 +759,7 @@ def test_a_run_interrupted_at_any_write_resumes(
             shutil.rmtree(folder)
         else:
             assert k > 100
-            assert contents(folder) == undisturbed
+            assert_resumes(folder, ROUNDS, undisturbed)
             return
 
 
@@ -940,7 +952,8 @@ def test_an_owner_elsewhere_is_believed_for_a_lease(tmp_path: Path, elsewhere: d
         taken_over(tmp_path)
 
 
-def test_a_commit_renews_the_lease(tmp_path: Path, no_fsync: None) -> None:
+@pytest.mark.usefixtures("no_fsync")
+def test_a_commit_renews_the_lease(tmp_path: Path) -> None:
     with RunWriter(Ledger(tmp_path)) as writer:
         writer.restore()
         edit_lock(tmp_path, heartbeat=0.0)
@@ -1024,7 +1037,7 @@ def test_the_loser_of_a_takeover_changes_nothing_that_counts(tmp_path: Path, oth
             lambda: loser.write_model({"w": np.zeros(2)}, {}),
             lambda: loser.write_segment(16, 8, {"rewards": np.zeros(8)}),
             lambda: loser.drop_segments(set()),
-            lambda: loser.restore(),
+            loser.restore,
         ]
         for attempt in attempts:
             with pytest.raises(RunLockedError, match=f"process {winner.pid}"):
@@ -1050,7 +1063,7 @@ def test_a_late_row_of_the_loser_does_not_spoil_what_the_winner_commits(
         write_round(loser, 1)
         lose(loser, winner)
         loser.append(METRICS, rows_of(2)[METRICS][0])
-    for number in (2, 3):  # the winner either commits what can be resumed, or says that it could not
+    for number in (2, 3, 4):  # the winner either commits what can be resumed, or says that it could not
         try:
             winner(f"writer.append(METRICS, {rows_of(number)[METRICS][0]!r})")
             status = f"Status('running', 'n', 1, 0, 9, {number}, 0.0, 0.0)"
@@ -1063,7 +1076,7 @@ def test_a_late_row_of_the_loser_does_not_spoil_what_the_winner_commits(
     with RunWriter(ledger) as writer:
         checkpoint = writer.restore()
     assert checkpoint is not None
-    assert checkpoint.round == 3
+    assert checkpoint.round == 4
 
 
 def test_one_of_many_gets_the_lock_of_a_dead_owner(tmp_path: Path, others: Callable[[], Other]) -> None:
@@ -1105,7 +1118,7 @@ def break_disk(patch: pytest.MonkeyPatch, code: int) -> None:
             raise OSError(code, os.strerror(code), str(path))
         return real_open(path, mode, *rest, **more)
 
-    def fsynced(descriptor: int) -> None:
+    def fsynced(_: int) -> None:
         raise OSError(code, os.strerror(code))
 
     patch.setattr(Path, "open", opened)
@@ -1129,9 +1142,10 @@ OPERATIONS: dict[str, Callable[[RunWriter], object]] = {
 def test_a_disk_that_refuses_is_named(run: Path, monkeypatch: pytest.MonkeyPatch, operation: str, code: int) -> None:
     with RunWriter(Ledger(run)) as writer:
         writer.restore()
-        with monkeypatch.context() as patch, pytest.raises(LedgerError) as caught:
+        with monkeypatch.context() as patch:
             break_disk(patch, code)
-            OPERATIONS[operation](writer)
+            with pytest.raises(LedgerError) as caught:
+                OPERATIONS[operation](writer)
     assert str(run) in str(caught.value)
     assert REFUSALS[code] in str(caught.value)
     assert restored(run) == ROUNDS
@@ -1140,13 +1154,10 @@ def test_a_disk_that_refuses_is_named(run: Path, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("code", REFUSALS, ids=errno.errorcode.get)
 def test_a_disk_that_refuses_the_lock_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     folder = tmp_path / "run"
-    with monkeypatch.context() as patch, pytest.raises(LedgerError) as caught, RunWriter(Ledger(folder)):
+    with monkeypatch.context() as patch:
         break_disk(patch, code)
-        pytest.fail("entered")
-    del patch
-    with monkeypatch.context() as patch, pytest.raises(LedgerError) as caught:
-        break_disk(patch, code)
-        RunWriter(Ledger(folder)).__enter__()
+        with pytest.raises(LedgerError) as caught, RunWriter(Ledger(folder)):
+            pass
     assert str(folder) in str(caught.value)
     assert REFUSALS[code] in str(caught.value)
 
@@ -1157,9 +1168,10 @@ def test_a_disk_that_fills_up_in_the_middle_of_a_row(run: Path, monkeypatch: pyt
 
     with RunWriter(Ledger(run)) as writer:
         writer.restore()
-        with monkeypatch.context() as patch, pytest.raises(LedgerError, match="the disk is full"):
+        with monkeypatch.context() as patch:
             hook(Faults(2, full), patch)
-            writer.append(METRICS, {"row": 99})
+            with pytest.raises(LedgerError, match="the disk is full"):
+                writer.append(METRICS, {"row": 99})
     assert Ledger(run).rows(committed_only=True) == all_rows(ROUNDS, METRICS)
     assert restored(run) == ROUNDS
 
