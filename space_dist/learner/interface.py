@@ -16,7 +16,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
 from space_dist.config import LearnerConfig
-from space_dist.envs import Observations
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.networks import is_mlp, torch_policy
 from space_dist.learner.normaliser import Normaliser
@@ -42,8 +41,6 @@ class Learner(abc.ABC):
     """
 
     model: Any
-
-    keeps_next_observations = False
 
     def __init__(
         self,
@@ -205,13 +202,6 @@ class Learner(abc.ABC):
     def remember(self, arrays: Mapping[str, NDArray[Any]], first: int) -> None:  # noqa: ARG002 - as above
         """Put back what `transitions(first)` gave. Raises RuntimeError where there is no buffer."""
         raise RuntimeError("this learner keeps no replay buffer")
-
-
-def tensors(observations: Observations) -> Any:
-    """Observations as SB3's policies take them."""
-    if isinstance(observations, dict):
-        return {name: torch.as_tensor(np.ascontiguousarray(array)) for name, array in observations.items()}
-    return torch.as_tensor(np.ascontiguousarray(observations))
 
 
 def schedule(rate: float, kind: str) -> Any:

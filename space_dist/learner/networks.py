@@ -99,7 +99,7 @@ class TorchPolicy:
         """See `policy.Policy`."""
         network: Any = _network(self)
         with torch.no_grad():
-            inputs = _tensors(self.statistics.scaled(observations))
+            inputs = tensors(self.statistics.scaled(observations))
             if self.config.kind == "dqn":
                 outputs = network.q_net(inputs)
             elif self.config.kind == "sac":
@@ -118,7 +118,7 @@ class TorchPolicy:
         """See `policy.Policy`."""
         network: Any = _network(self)
         with torch.no_grad():
-            inputs = _tensors(self.statistics.scaled(observations))
+            inputs = tensors(self.statistics.scaled(observations))
             if isinstance(network, ActorCriticPolicy):
                 values = network.predict_values(inputs)[:, 0]
             elif self.config.kind == "dqn":
@@ -165,7 +165,8 @@ def _network(policy: TorchPolicy) -> BasePolicy:
     return network
 
 
-def _tensors(observations: Observations) -> Any:
+def tensors(observations: Observations) -> Any:
+    """Observations as SB3's policies take them."""
     if isinstance(observations, dict):
         return {name: torch.as_tensor(np.ascontiguousarray(array)) for name, array in observations.items()}
     return torch.as_tensor(np.ascontiguousarray(observations))

@@ -32,7 +32,6 @@ class OffPolicyLearner(Learner):
     """What DQN, SAC and TD3 share: the replay buffer, and the ratio of gradient steps to environment steps."""
 
     model: OffPolicyAlgorithm
-    keeps_next_observations = True
 
     def __init__(
         self,

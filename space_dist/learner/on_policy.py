@@ -15,8 +15,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from space_dist.config import A2CConfig, PPOConfig, TRPOConfig
 from space_dist.envs import Observations
 from space_dist.envs.observations import concatenate, each, put, rows
-from space_dist.learner.interface import Learner, schedule, tensors
-from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs
+from space_dist.learner.interface import Learner, schedule
+from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs, tensors
 from space_dist.policy import Head, MlpPolicy, Statistics
 from space_dist.rollout import Shard
 
