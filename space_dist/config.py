@@ -63,11 +63,11 @@ class GrowingConfig(_Section):
 
     eta: float = Field(default=0.1, gt=0.0)
     """Growth threshold: the set grows when the mean start value changed by at most this share. Source: the authors' run
-    scripts use 0.1, section 5.6 recommends 0.05, appendix A (CartPole) uses 0.025."""
+    scripts use 0.1, section 5.7 recommends 0.05, appendix A (CartPole) uses 0.025."""
     kappa: int = Field(default=1, ge=1)
-    """Instances added per growth, or with growth: multiply the factor. Source: section 5.6 recommends 1."""
+    """Instances added per growth, or with growth: multiply the factor. Source: section 5.7 recommends 1."""
     growth: Literal["add", "multiply", "schedule"] = "add"
-    """add: S + kappa. multiply: S * kappa (kappa of at least 2). Source: Algorithm 1; section 5.6, figure "fast rising
+    """add: S + kappa. multiply: S * kappa (kappa of at least 2). Source: Algorithm 1; section 5.7, figure "fast rising
     set size"."""
     mean: Literal["same_set", "as_printed", "mean_abs_change"] = "same_set"
     """What eta is compared with. same_set: change of the mean |V| over the set just trained on. as_printed: V_{t-1} is
@@ -100,7 +100,7 @@ class SpaceConfig(GrowingConfig):
     kind: Literal["space"]
     """Which curriculum: SPaCE."""
     growth: Literal["add", "multiply"] = "add"
-    """add: S + kappa. multiply: S * kappa (kappa of at least 2). Source: Algorithm 1; section 5.6, figure "fast rising
+    """add: S + kappa. multiply: S * kappa (kappa of at least 2). Source: Algorithm 1; section 5.7, figure "fast rising
     set size"."""
     pic: Literal["improvement", "abs", "relative", "lowest_value", "random"] = "improvement"
     """What instances are ranked by. improvement: signed change of the start value, highest first. abs: its size.
