@@ -28,6 +28,7 @@ import os
 import socket
 import threading
 import time
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -35,7 +36,6 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
 from space_dist.errors import LedgerError, RunLockedError
@@ -175,12 +175,11 @@ class Ledger:
             crc = data.pop("crc")
             if crc != zlib.crc32(json.dumps(data, sort_keys=True).encode()):
                 raise ValueError("checksum")
-            status = Status(**data)
+            if data["format"] != FORMAT:
+                raise LedgerError(f"{self.status_file} has format {data['format']}; this version reads format {FORMAT}")
+            return Status(**data)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             raise LedgerError(f"{self.status_file} is damaged") from None
-        if status.format != FORMAT:
-            raise LedgerError(f"{self.status_file} has format {status.format}; this version reads format {FORMAT}")
-        return status
 
     def rows(self, name: str = METRICS, *, committed_only: bool = False) -> list[Row]:
         """The intact rows of a file from its start; a torn last row (a run being written or killed) is left out.
@@ -192,6 +191,8 @@ class Ledger:
             content = path.read_bytes()
         except FileNotFoundError:
             return []
+        except OSError as error:
+            raise LedgerError(f"{path} cannot be read: {error.strerror}") from None
         if committed_only:
             content = content[: self.status().committed.get(name, 0)]
         lines = content.splitlines(keepends=True)
@@ -213,7 +214,7 @@ class Ledger:
         """Whether a live process works on this run now, as far as can be told from this machine."""
         try:
             owner = json.loads(self.lock_file.read_bytes() or b"{}")
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return False
         return isinstance(owner, dict) and _believed_alive(owner)
 
@@ -252,6 +253,8 @@ def decode_checkpoint(content: bytes) -> Checkpoint:
                 raise ValueError("compressed")
             if sum(info.file_size for info in infos) > len(content):
                 raise ValueError("sizes do not add up")
+            if archive.testzip() is not None:  # before NumPy parses a header that may have changed
+                raise ValueError("a checksum does not match")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             meta = json.loads(file["meta"].tobytes())
             arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "meta"}
@@ -261,7 +264,8 @@ def decode_checkpoint(content: bytes) -> Checkpoint:
         segments = tuple(Segment(int(first), int(count), str(sha)) for first, count, sha in meta["segments"])
         return Checkpoint(round=int(meta["round"]), arrays=arrays, data=dict(meta["data"]), segments=segments)
     except (zipfile.BadZipFile, KeyError, TypeError, AttributeError, OSError, EOFError, RecursionError,
-            NotImplementedError, RuntimeError, MemoryError, zlib.error) as error:  # fmt: skip
+            NotImplementedError, RuntimeError, MemoryError, SyntaxError, OverflowError, tokenize.TokenError,
+            zlib.error) as error:  # fmt: skip
         raise ValueError(str(error)) from None
 
 
@@ -295,7 +299,11 @@ class RunWriter:
         with _clear_errors(self.ledger.folder):
             self.ledger.folder.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
-            self.ledger.checkpoints.mkdir(exist_ok=True)
+            try:
+                self.ledger.checkpoints.mkdir(exist_ok=True)
+            except BaseException:
+                self._lock.release()
+                raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -322,7 +330,7 @@ class RunWriter:
             except (ValueError, OSError) as error:
                 reasons.append(f"{file.name}: {error}")
                 continue
-            with self._lock.held():
+            with _clear_errors(self.ledger.folder), self._lock.held():
                 self._cut(prefixes)
                 for newer in files[: files.index(file)]:
                     newer.unlink()
@@ -332,7 +340,7 @@ class RunWriter:
                 f"{self.ledger.folder} cannot be resumed: no checkpoint is intact ({'; '.join(reasons)}). "
                 "Nothing was changed; start the run in another folder"
             )
-        with self._lock.held():
+        with _clear_errors(self.ledger.folder), self._lock.held():
             self._cut(dict.fromkeys(ROW_FILES, b""))
         return None
 
@@ -363,9 +371,13 @@ class RunWriter:
             self._hashes[name] = hashlib.sha256(content)
 
     def append(self, name: str, row: Row) -> None:
-        """Add a row; it counts once a checkpoint covers it."""
+        """Add a row; it counts once a checkpoint covers it. Raises RunLockedError if the run is no longer ours."""
         line = encode_row(row)
-        with _clear_errors(self.ledger.folder), (self.ledger.folder / name).open("ab") as file:
+        with (
+            _clear_errors(self.ledger.folder),
+            self._lock.held(sign_of_life=False),
+            (self.ledger.folder / name).open("ab") as file,
+        ):
             file.write(line)
         self._sizes[name] += len(line)
         self._hashes[name].update(line)
@@ -486,7 +498,7 @@ def _this_process() -> dict[str, Any]:
         "boot_id": read("/proc/sys/kernel/random/boot_id"),
         "pid_namespace": pid_namespace,
         "pid": os.getpid(),
-        "started": psutil.Process().create_time(),
+        "started": _started(os.getpid()),
     }
 
 
@@ -497,17 +509,21 @@ def _believed_alive(owner: Mapping[str, Any]) -> bool:
     here = _this_process()
     same_kernel = here["boot_id"] and owner.get("boot_id") == here["boot_id"]
     if same_kernel and owner.get("pid_namespace") == here["pid_namespace"]:
-        try:
-            process = psutil.Process(int(owner["pid"]))
-            return bool(
-                abs(process.create_time() - float(owner["started"])) < 1.0 and process.status() != psutil.STATUS_ZOMBIE
-            )
-        except (psutil.NoSuchProcess, KeyError, ValueError, TypeError):
-            return False
+        pid, started = owner.get("pid"), owner.get("started")
+        return isinstance(pid, int) and started is not None and _started(pid) == started
     try:
-        return time.time() - float(owner["heartbeat"]) < LEASE_SECONDS
-    except (KeyError, ValueError, TypeError):
+        return abs(time.time() - float(owner["heartbeat"])) < LEASE_SECONDS  # clocks of two hosts differ
+    except (KeyError, ValueError, TypeError, OverflowError):
         return False
+
+
+def _started(pid: int) -> int | None:
+    """When a living process began, in clock ticks since boot: unlike a time of day, no clock setting changes it."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if fields[0] == "Z" else int(fields[19])
 
 
 class _Lock:
@@ -530,7 +546,7 @@ class _Lock:
         file.seek(0)
         try:
             owner = json.loads(file.read(_MAX_STATUS_BYTES) or b"{}")
-        except ValueError:
+        except (ValueError, RecursionError):
             return {}
         return owner if isinstance(owner, dict) else {}
 
@@ -565,7 +581,7 @@ class _Lock:
                 pass
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
+    def held(self, *, sign_of_life: bool = True) -> Iterator[None]:
         """Do something that only the owner may do. Raises RunLockedError if that is no longer us."""
         with self._locked_file() as file:
             owner = self._read(file)
@@ -574,7 +590,8 @@ class _Lock:
                     f"{self._path.parent} was taken over by process {owner.get('pid')} on {owner.get('host')}; "
                     "this process stops and changes nothing more"
                 )
-            self._write(file)
+            if sign_of_life:  # which costs a write to disk
+                self._write(file)
             yield
 
     def release(self) -> None:
