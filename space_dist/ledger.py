@@ -293,6 +293,7 @@ class RunWriter:
         self._lock = _Lock(ledger.lock_file)
         self._hashes = {name: hashlib.sha256() for name in ROW_FILES}
         self._sizes = dict.fromkeys(ROW_FILES, 0)
+        self._named: dict[str, set[str]] = {}  # the pieces of replay buffers that each checkpoint names
         self.status: Status | None = None
 
     def __enter__(self) -> RunWriter:
@@ -402,6 +403,8 @@ class RunWriter:
             )
             for old in self.ledger.checkpoint_files()[KEPT_CHECKPOINTS:]:
                 old.unlink()
+            self._named[path.name] = {segment.name for segment in checkpoint.segments}
+            self._drop_unnamed_segments()
 
     def write_segment(self, first: int, count: int, arrays: Mapping[str, NDArray[Any]]) -> Segment:
         """Store a piece of a replay buffer; it counts once a checkpoint names it."""
@@ -419,12 +422,22 @@ class RunWriter:
         with np.load(self._segment_path(segment), allow_pickle=False) as file:
             return dict(file)
 
-    def drop_segments(self, kept: set[str]) -> None:
-        """Remove the pieces that no checkpoint names any more."""
-        with _clear_errors(self.ledger.folder), self._lock.held():
-            for path in self.ledger.replay.glob("*.npz"):
-                if path.name not in kept:
-                    path.unlink()
+    def _drop_unnamed_segments(self) -> None:
+        """Remove the pieces of replay buffers that no checkpoint names any more."""
+        pieces = list(self.ledger.replay.glob("*.npz"))
+        if not pieces:
+            return
+        kept = self.ledger.checkpoint_files()
+        for file in kept:
+            if file.name not in self._named:  # written before this process took the run over
+                with contextlib.suppress(ValueError):
+                    segments = decode_checkpoint(file.read_bytes()).segments
+                    self._named[file.name] = {segment.name for segment in segments}
+        self._named = {file.name: self._named.get(file.name, set()) for file in kept}
+        named = set().union(*self._named.values())
+        for piece in pieces:
+            if piece.name not in named:
+                piece.unlink()
 
     def _segment_path(self, segment: Segment) -> Path:
         return self.ledger.replay / segment.name

@@ -71,10 +71,12 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         episodes_per_round=config.n_episodes,
         keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
     )
-    if config.budget.steps < config.round_steps(horizon):
+    probes = config.learner.normalize_observations or config.learner.normalize_rewards
+    needed = config.round_steps(horizon) * (2 if probes else 1)
+    if config.budget.steps < needed:
         raise ConfigError(
-            f"budget.steps = {config.budget.steps} is less than the {config.round_steps(horizon)} steps that one round "
-            f"of learner.n_episodes = {config.n_episodes} episodes may take"
+            f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
+            + (", and the round before it that gives normalisation its first scales" if probes else "")
         )
     if setup.slot_length < horizon:
         raise ConfigError(
@@ -410,10 +412,7 @@ class Training:
         self._settle()
         # A run is done only once its model is written.
         status = self._new_status("running" if state == "done" else state, message)
-        older = {segment.name for segment in self._run.segments}
         self._writer.commit(self._save(), status)
-        if self._run.segments:
-            self._writer.drop_segments(older | {segment.name for segment in self._run.segments})
         self._last_commit_time, self._last_commit_round = time.monotonic(), self._run.round
 
     def _new_status(self, state: Any, message: str | None = None) -> Status:

@@ -14,7 +14,7 @@ from space_dist import config as configs
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, private_ray, read_instances
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
-from space_dist.training import make_learner, make_setup
+from space_dist.training import learner_of, make_setup
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
@@ -54,12 +54,12 @@ def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -
     run = config(1)
     setup = make_setup(run, *read_instances(run))
     with cluster_class(run, setup) as cluster:
-        weights = cluster.put(make_learner(run).weights(0))
-        decision = cluster.begin(cluster.start_values(weights))
+        policy = cluster.put(learner_of(run).policy(0))
+        decision = cluster.begin(cluster.start_values(policy))
         from space_dist.rollout import Walk
 
-        shards = cluster.collect(weights, decision.selection, Walk(-1, ()), round=0, version=0)
-        assert len(cluster.get([*shards, *cluster.evaluate(weights, "test")])) == 2 * run.rollout.shards
+        shards = cluster.collect(policy, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
+        assert len(cluster.get([*shards, *cluster.evaluate(policy, "test")])) == 2 * run.rollout.shards
         for actor in cluster._actors.values():
             # By value: a function of this module would make the actor import it, and all that it imports.
             names = ray.get(actor.__ray_call__.remote(lambda self: list(__import__("sys").modules)))
@@ -78,8 +78,8 @@ def test_killed_actors_are_replaced_and_change_nothing(
     killed: list[int] = []
     collect: Callable[..., list[Any]] = cluster_class.collect
 
-    def kill_then_collect(self: Any, *arguments: Any, round: int, version: int) -> list[Any]:
-        handles = collect(self, *arguments, round=round, version=version)
+    def kill_then_collect(self: Any, *arguments: Any, round: int, **options: Any) -> list[Any]:
+        handles = collect(self, *arguments, round=round, **options)
         if round in (2, 5):  # while the shards, and the decision they need, are under way
             for victim in victims:
                 ray.kill(self._actors[victim])

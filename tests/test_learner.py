@@ -22,7 +22,7 @@ from space_dist.envs import BatchedEnv, make_batched
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
-from space_dist.learner import Learner
+from space_dist.learner import Learner, OnPolicyLearner, make_learner
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Episodes, Shard, collect
 
@@ -40,9 +40,9 @@ def small(kind: str = "ppo", **changes: Any) -> LearnerConfig:
 def learner_for(
     config: LearnerConfig, env_id: str = LINE, *, seed: int = 0, n_slots: int = 2 * SLOTS, length: int = LENGTH,
     updates: int = 4,
-) -> Learner:  # fmt: skip
+) -> Any:  # fmt: skip
     env = make_batched(env_id, 1, context_visible=True)
-    return Learner(
+    return make_learner(
         config, env.observation_space, env.action_space,
         seed=seed, n_slots=n_slots, slot_length=length, total_steps=updates * n_slots * length,
     )  # fmt: skip
@@ -55,7 +55,7 @@ def shards_of(learner: Learner, env_id: str = LINE, *, round: int = 0, length: i
     contexts = np.random.default_rng(0).uniform(bounds.low, bounds.high, size=(5, len(bounds.names)))
     selection = Selection(0, np.arange(5), contexts, 0)
     return [
-        collect(env, learner.weights(round), selection, start=2 * shard, length=length, gamma=0.9, seed=1, round=round,
+        collect(env, learner.policy(round), selection, start=2 * shard, length=length, gamma=0.9, seed=1, round=round,
                 shard=shard)
         for shard in range(n)
     ]  # fmt: skip
@@ -83,12 +83,12 @@ def hand_made(rewards: Any, terminated: Any, truncated: Any, *, shard: int = 0) 
     length, slots = rewards.shape
     none, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
     return Shard(
-        shard=shard, round=0, weights_version=0, selection_version=0, order_version=0,
+        shard=shard, round=0, policy_version=0, selection_version=0, order_version=0,
         observations=np.zeros((length, slots, 2), dtype=np.float32),
         actions=np.zeros((length, slots, 2), dtype=np.float32), rewards=rewards,
         terminated=terminated, truncated=truncated,
         last_observations=np.zeros((slots, 2), dtype=np.float32),
-        truncated_observations=np.zeros((int(truncated.sum()), 2), dtype=np.float32),
+        truncated_observations=np.zeros((int(truncated.sum()), 2), dtype=np.float32), next_observations=None,
         episodes=Episodes(none, none, none, none, nothing, nothing, nothing, none),
     )  # fmt: skip
 
@@ -209,7 +209,7 @@ def test_advantages_by_hand(kind: str) -> None:
     # V = 4 everywhere, rewards 1, gamma 1/2, lambda 1/2: delta = 1 + 2 - 4 = -1, and 1 - 4 = -3 at a terminal step;
     # A_t = delta_t + A_{t+1} / 4 within an episode. Beyond a cut and a timeout the value is 4 all the same.
     config = small(kind, gamma=0.5, gae_lambda=0.5, n_steps=16)
-    learner = Learner(config, BOX, BOX, seed=0, n_slots=4, slot_length=4, total_steps=16)
+    learner = OnPolicyLearner(config, BOX, BOX, seed=0, n_slots=4, slot_length=4, total_steps=16)
     with torch.no_grad():
         learner.model.policy.value_net.weight.zero_()
         learner.model.policy.value_net.bias.fill_(4.0)
@@ -228,7 +228,7 @@ def test_advantages_by_hand(kind: str) -> None:
     np.testing.assert_allclose(buffer.rewards, [[1, 1, 1, 1], [1, 1, 1, 3], [1, 1, 1, 1], [1, 3, 1, 1]])
     np.testing.assert_array_equal(buffer.episode_starts, [[1, 1, 1, 1], [0, 0, 0, 0], [1, 0, 0, 1], [0, 0, 0, 0]])
     # Actions of 0 under means of about 0 and a standard deviation of 1, in two dimensions.
-    expected_log_prob = -np.log(2 * np.pi) - (learner.weights(0).actor[-1][1] ** 2).sum() / 2
+    expected_log_prob = -np.log(2 * np.pi) - (learner.policy(0).actor[-1][1] ** 2).sum() / 2
     np.testing.assert_allclose(buffer.log_probs, expected_log_prob, rtol=1e-5)
 
 
@@ -271,11 +271,9 @@ def test_a_checkpoint_restores_the_learner_bit_for_bit(config: LearnerConfig, en
     fresh._seed = learner._seed
     assert [update(fresh, number, env_id) for number in (2, 3)] == metrics
     assert bits(fresh) == bits(learner)
-    told, expected = fresh.weights(4), learner.weights(4)
-    for part in ("actor", "critic"):
-        for (matrix, bias), (matrix_expected, bias_expected) in zip(
-            getattr(told, part), getattr(expected, part), strict=True
-        ):
+    told, expected = fresh.policy(4), learner.policy(4)
+    for part, part_expected in ((told.actor, expected.actor), (told.critics[0], expected.critics[0])):
+        for (matrix, bias), (matrix_expected, bias_expected) in zip(part, part_expected, strict=True):
             np.testing.assert_array_equal(matrix, matrix_expected)
             np.testing.assert_array_equal(bias, bias_expected)
 
@@ -394,8 +392,8 @@ def test_an_update_that_stops_early_counts_what_it_did() -> None:
     [spaces.Box(-1.0, 1.0, shape=(2, 2)), spaces.Box(-1.0, 1.0, shape=()), spaces.Discrete(4), spaces.Dict({"x": BOX})],
 )
 def test_observations_that_are_not_flat_are_refused(observation_space: spaces.Space[Any]) -> None:
-    with pytest.raises(ConfigError, match="observations must be flat"):
-        Learner(small(), observation_space, BOX, seed=0, n_slots=1, slot_length=4, total_steps=4)
+    with pytest.raises(ConfigError, match="MlpPolicy needs flat observations"):
+        make_learner(small(), observation_space, BOX, seed=0, n_slots=1, slot_length=4, total_steps=4)
 
 
 @pytest.mark.parametrize(
@@ -407,7 +405,7 @@ def test_observations_that_are_not_flat_are_refused(observation_space: spaces.Sp
 )  # fmt: skip
 def test_actions_that_are_neither_flat_nor_counted_from_0_are_refused(action_space: spaces.Space[Any]) -> None:
     with pytest.raises(ConfigError, match="one-dimensional Box or Discrete from 0"):
-        Learner(small(), BOX, action_space, seed=0, n_slots=1, slot_length=4, total_steps=4)
+        make_learner(small(), BOX, action_space, seed=0, n_slots=1, slot_length=4, total_steps=4)
 
 
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE])

@@ -17,27 +17,9 @@ from space_dist.curricula import Selection
 from space_dist.envs import ContextObservation, make_batched
 from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
 from space_dist.instances import ContextBounds, InstanceSet
-from space_dist.learner import Learner
-from space_dist.rollout import (
-    CHUNK,
-    CUT,
-    TERMINATED,
-    TRUNCATED,
-    MlpWeights,
-    Outcomes,
-    Setup,
-    Shard,
-    Walk,
-    Worker,
-    act,
-    collect,
-    executed,
-    forward,
-    from_arrays,
-    joined,
-    to_arrays,
-    values,
-)
+from space_dist.learner import make_learner
+from space_dist.policy import Actions, Head, MlpPolicy, Noise, forward, from_arrays, to_arrays
+from space_dist.rollout import CHUNK, CUT, TERMINATED, TRUNCATED, Outcomes, Setup, Shard, Walk, Worker, collect, joined
 from space_dist.seeding import Purpose, episode_seeds, generator
 from tests import tiny_env
 
@@ -74,8 +56,9 @@ class Countdown:
 
 
 def weights_for(
-    observation_dim: int, outputs: int, *, discrete: bool = False, version: int = 0, seed: int = 0, bias: float = 0.0
-) -> MlpWeights:
+    observation_dim: int, outputs: int,
+    *, discrete: bool = False, version: int = 0, seed: int = 0, bias: float = 0.0, bound: float = 1.0,
+) -> MlpPolicy:  # fmt: skip
     """A random network whose actions depend on what it sees; `bias` is added to its last output."""
     random = np.random.default_rng(seed)
 
@@ -87,13 +70,19 @@ def weights_for(
 
     actor, critic = layers(observation_dim, 8, outputs), layers(observation_dim, 8, 1)
     actor[-1][1][-1] += np.float32(bias)
-    log_std = None if discrete else np.full(outputs, 0.3, dtype=np.float32)
-    return MlpWeights(version, "tanh", actor, critic, log_std)
+    low, high = np.full(outputs, -bound, dtype=np.float32), np.full(outputs, bound, dtype=np.float32)
+    log_std = np.full(outputs, 0.3, dtype=np.float32)
+    head = Head("categorical") if discrete else Head("gaussian", log_std, low, high)
+    return MlpPolicy(version, "tanh", head, actor, (critic,))
 
 
-def falling(version: int = 0, seed: int = 0) -> MlpWeights:
+def best(policy: MlpPolicy, observations: NDArray[np.float32]) -> Actions:
+    return policy.head.best(policy.outputs(observations))
+
+
+def falling(version: int = 0, seed: int = 0) -> MlpPolicy:
     """PointMass weights (context visible) that mostly fall onto the wall, but not always."""
-    return weights_for(7, 2, version=version, seed=seed, bias=-2.0)
+    return weights_for(7, 2, version=version, seed=seed, bias=-2.0, bound=10.0)
 
 
 def select(contexts: FloatArray, *, version: int = 0, ids: IntArray | None = None) -> Selection:
@@ -128,7 +117,9 @@ def bits(answer: Shard | Outcomes) -> dict[str, Any]:
 def falls(worker: Worker, *, round: int = 0, shard: int = 0, start: Walk | None = None) -> Shard:
     selection = select(uniform(6), version=4)
     walk = start or Walk(-1, ())
-    return worker.collect(falling(version=round), selection, walk, round=round, shard=shard, selection_version=4)
+    return worker.collect(
+        falling(version=round), selection, walk, round=round, steps=0, shard=shard, selection_version=4
+    )
 
 
 # ---- policies in NumPy ----
@@ -142,13 +133,14 @@ def test_networks_equal_stable_baselines3s(
 ) -> None:
     space = spaces.Box(-np.inf, np.inf, shape=(6,), dtype=np.float32)
     config = PPOConfig(kind="ppo", activation=activation, net_arch=net_arch, log_std_init=-0.5)
-    learner = Learner(config, space, action_space, seed=0, n_slots=2, slot_length=4, total_steps=8)
+    learner = make_learner(config, space, action_space, seed=0, n_slots=2, slot_length=4, total_steps=8)
     policy = learner.model.policy
     with torch.no_grad():  # far from their initial scale, biases included
         generator = torch.Generator().manual_seed(1)
         for parameter in policy.parameters():
             parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.5)
-    weights = learner.weights(7)
+    weights = learner.policy(7)
+    assert isinstance(weights, MlpPolicy)
     assert weights.version == 7
     random = np.random.default_rng(2)
     observations = random.normal(0.0, 2.0, size=(500, 6)).astype(np.float32)
@@ -156,33 +148,34 @@ def test_networks_equal_stable_baselines3s(
     with torch.no_grad():
         distribution = policy.get_distribution(tensor).distribution
         expected_values = policy.predict_values(tensor).numpy()[:, 0]
-    np.testing.assert_allclose(values(weights, observations), expected_values, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(weights.values(observations), expected_values, rtol=1e-5, atol=1e-5)
     outputs = forward(weights.actor, weights.activation, observations)
-    best = executed(action_space, act(weights, observations, None))
+    executed = weights.head.executed(best(weights, observations))
     expected_best, _ = policy.predict(observations, deterministic=True)
     if isinstance(action_space, spaces.Box):
         np.testing.assert_allclose(outputs, distribution.mean, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(best, expected_best, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(executed, expected_best, rtol=1e-5, atol=1e-5)
         noise = random.normal(size=(500, 3)).astype(np.float32)
-        sampled = distribution.mean + distribution.stddev * torch.as_tensor(noise)
-        np.testing.assert_allclose(act(weights, observations, noise), sampled, rtol=1e-5, atol=1e-5)
+        expected = distribution.mean + distribution.stddev * torch.as_tensor(noise)
+        sampled = weights.head.sampled(outputs, Noise(noise[None], noise[None]), 0, np.arange(500))
+        np.testing.assert_allclose(sampled, expected, rtol=1e-5, atol=1e-5)
     else:
         shifted = outputs - np.logaddexp.reduce(outputs, axis=1, keepdims=True)
         np.testing.assert_allclose(shifted, distribution.logits, rtol=1e-5, atol=1e-5)
-        np.testing.assert_array_equal(best, expected_best)
+        np.testing.assert_array_equal(executed, expected_best)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), [(2, 2), (1, 1)])
 def test_weights_are_a_copy_and_inputs_stay_untouched(inputs: int, outputs: int) -> None:
     space, actions = (spaces.Box(-1.0, 1.0, shape=(n,), dtype=np.float32) for n in (inputs, outputs))
-    learner = Learner(PPOConfig(kind="ppo"), space, actions, seed=0, n_slots=1, slot_length=4, total_steps=8)
-    weights, observations = learner.weights(0), np.ones((3, inputs), dtype=np.float32)
-    before = act(weights, observations, None), values(weights, observations)
+    learner = make_learner(PPOConfig(kind="ppo"), space, actions, seed=0, n_slots=1, slot_length=4, total_steps=8)
+    weights, observations = learner.policy(0), np.ones((3, inputs), dtype=np.float32)
+    before = best(weights, observations), weights.values(observations)
     with torch.no_grad():
         for parameter in learner.model.policy.parameters():
             parameter.add_(1.0)
-    np.testing.assert_array_equal(act(weights, observations, None), before[0])
-    np.testing.assert_array_equal(values(weights, observations), before[1])
+    np.testing.assert_array_equal(best(weights, observations), before[0])
+    np.testing.assert_array_equal(weights.values(observations), before[1])
     np.testing.assert_array_equal(observations, 1.0)
 
 
@@ -192,20 +185,22 @@ def test_a_policy_survives_being_arrays(discrete: bool) -> None:
     again = from_arrays(*to_arrays(weights))
     observations = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
     assert (again.version, again.activation) == (9, "tanh")
-    np.testing.assert_array_equal(act(again, observations, None), act(weights, observations, None))
-    np.testing.assert_array_equal(values(again, observations), values(weights, observations))
-    np.testing.assert_array_equal(again.log_std, weights.log_std)
+    np.testing.assert_array_equal(best(again, observations), best(weights, observations))
+    np.testing.assert_array_equal(again.values(observations), weights.values(observations))
+    assert again.head.kind == weights.head.kind
+    for name in ("log_std", "low", "high"):
+        np.testing.assert_array_equal(getattr(again.head, name), getattr(weights.head, name))
 
 
 def test_actions_are_clipped_as_stable_baselines3_clips_them() -> None:
-    space = spaces.Box(np.float32([-1.0, -2.0]), np.float32([0.5, 4.0]))
+    head = Head("gaussian", np.zeros(2, np.float32), np.float32([-1.0, -2.0]), np.float32([0.5, 4.0]))
     actions = np.float32([[-3.0, -3.0], [0.6, 4.5], [0.1, 0.2], [np.inf, -np.inf]])
     given = actions.copy()
     np.testing.assert_array_equal(
-        executed(space, actions), np.float32([[-1.0, -2.0], [0.5, 4.0], [0.1, 0.2], [0.5, -2.0]])
+        head.executed(actions), np.float32([[-1.0, -2.0], [0.5, 4.0], [0.1, 0.2], [0.5, -2.0]])
     )
     np.testing.assert_array_equal(actions, given)
-    np.testing.assert_array_equal(executed(spaces.Discrete(3), np.array([0, 2, 1])), [0, 2, 1])
+    np.testing.assert_array_equal(Head("categorical").executed(np.array([0, 2, 1])), [0, 2, 1])
 
 
 def test_discrete_actions_are_drawn_from_the_softmax() -> None:
@@ -293,7 +288,7 @@ def test_a_shards_table_tells_what_its_arrays_hold() -> None:
     contexts = uniform(7)
     selection = dataclasses.replace(select(contexts, version=3), order_version=2)
     shard = collect(env, falling(version=5), selection, start=4, length=length, gamma=gamma, seed=2, round=5, shard=1)
-    assert (shard.shard, shard.round, shard.weights_version, shard.selection_version, shard.order_version) == (
+    assert (shard.shard, shard.round, shard.policy_version, shard.selection_version, shard.order_version) == (
         1, 5, 5, 3, 2
     )  # fmt: skip
     assert shard.observations.shape == (length, slots, 7)
@@ -361,7 +356,7 @@ def test_a_shard_replays_by_hand_from_its_seeds() -> None:
     # Actions are the policy's, with the stated noise.
     noise = generator(seed, Purpose.ACTIONS, 2, 1).standard_normal((length, slots, 2), dtype=np.float32)
     means = forward(weights.actor, "tanh", told.observations.reshape(-1, 7)).reshape(length, slots, 2)
-    np.testing.assert_allclose(told.actions, means + np.exp(weights.log_std) * noise, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(told.actions, means + np.exp(weights.head.log_std) * noise, rtol=1e-5, atol=1e-5)
 
 
 def test_a_shard_is_a_pure_function_of_what_was_asked() -> None:
@@ -415,14 +410,14 @@ def test_a_version_that_was_not_asked_for_is_refused(selection_version: int, wei
     with pytest.raises(RuntimeError, match=f"selection {selection_version} "):
         Worker(setup_for()).collect(
             falling(version=weights_version), selection, Walk(-1, ()),
-            round=0, shard=0, selection_version=selection_version,
+            round=0, steps=0, shard=0, selection_version=selection_version,
         )  # fmt: skip
 
 
 # ---- evaluating ----
 
 
-def flown(weights: MlpWeights, context: FloatArray, seed: int, gamma: float) -> tuple[float, float, int, float]:
+def flown(weights: MlpPolicy, context: FloatArray, seed: int, gamma: float) -> tuple[float, float, int, float]:
     """Return, discounted return, length and success of one deterministic episode, stepped alone."""
     env = ContextObservation(gym.make(POINTMASS))
     observation, _ = env.reset(seed=seed, options={"context": context})
@@ -442,12 +437,10 @@ def test_evaluation_is_one_whole_episode_per_row(split: Any) -> None:
     worker = Worker(setup)
     parts = [worker.evaluate(weights, split, part) for part in range(setup.evaluation_parts)]
     told = joined(parts)
-    assert told.weights_version == 8
+    assert told.policy_version == 8
     assert len(told.returns) == 2 * len(instances)
     seeds = episode_seeds(3, Purpose.EVALUATION, int(split == "test"), count=2 * len(instances))
-    expected = [
-        flown(weights, instances.contexts[row // 2], int(seed), setup.gamma) for row, seed in enumerate(seeds)
-    ]
+    expected = [flown(weights, instances.contexts[row // 2], int(seed), setup.gamma) for row, seed in enumerate(seeds)]
     returns, discounted, lengths, success = zip(*expected, strict=True)
     np.testing.assert_array_equal(told.lengths, lengths)
     np.testing.assert_allclose(told.returns, returns, rtol=1e-5)
@@ -514,7 +507,7 @@ def test_start_values_are_means_over_seeded_starts(monkeypatch: pytest.MonkeyPat
         starts = tiny_env.make(1000).reset(np.arange(1000), target, mine)
         assert np.ptp(starts) > tiny_env.START
         observed = np.concatenate([starts, target], axis=1).astype(np.float32)
-        expected = values(weights, observed).astype(np.float64).mean()
+        expected = weights.values(observed).mean()
         assert told[chunk][place] == pytest.approx(expected, rel=1e-5)
     # Whoever computes a chunk, in whatever order and how often, it has the same bits.
     late = Worker(setup)
@@ -531,4 +524,4 @@ def test_joined_chunks_equal_one_big_evaluation() -> None:
     told = np.concatenate([worker.start_values(weights, chunk) for chunk in range(3)])
     scaled = 2.0 * (contexts - LOW) / (HIGH - LOW) - 1.0
     observed = np.concatenate([np.tile([0.0, 0.0, 3.0, 0.0], (n, 1)), scaled], axis=1).astype(np.float32)
-    np.testing.assert_allclose(told, values(weights, observed), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(told, weights.values(observed), rtol=1e-5, atol=1e-6)

@@ -1,10 +1,12 @@
 """An environment that must be learnt in seconds: move along a line to a target, which only the context tells.
 
-`tests.tiny_env:make` (continuous actions) and `tests.tiny_env:make_discrete` are its import paths for a config.
+`tests.tiny_env:make` (continuous actions) and `tests.tiny_env:make_discrete` are its import paths for a config;
+`make_scaled`, `make_image` and `make_dict` show the same line in other units, as pictures and in parts.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ HORIZON = 8
 STRIDE = 0.25  # how far a full action moves
 START = 0.1  # starts are uniform in [-START, START]
 SUCCESS_DISTANCE = 0.1
+PIXELS = 36  # the least that SB3's convolutions take
 
 
 class Line:
@@ -59,3 +62,88 @@ def make(n_slots: int) -> Line:
 
 def make_discrete(n_slots: int) -> Line:
     return Line(n_slots, spaces.Discrete(3))
+
+
+class Scaled(Line):
+    """The line in other units: rewards and observations times a number each; contexts stay as they are."""
+
+    def __init__(self, n_slots: int, rewards: float, observations: float) -> None:
+        super().__init__(n_slots, spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32))
+        self.observation_space = spaces.Box(-observations, observations, shape=(1,), dtype=np.float32)
+        self._rewards, self._observations = rewards, np.float32(observations)
+
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
+        return super().reset(slots, contexts, seeds) * self._observations
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        step = super().step(actions)
+        return dataclasses.replace(
+            step, observations=step.observations * self._observations, rewards=step.rewards * self._rewards
+        )
+
+
+def make_scaled(n_slots: int, rewards: float = 1.0, observations: float = 1.0) -> Scaled:
+    return Scaled(n_slots, rewards, observations)
+
+
+class Shown(Line):
+    """The line as `observe(x, target)` shows it; episodes last 4 steps."""
+
+    def __init__(self, n_slots: int, discrete: bool) -> None:
+        super().__init__(n_slots, spaces.Discrete(3) if discrete else spaces.Box(-1.0, 1.0, shape=(1,)))
+        self.horizon = 4
+
+    def observe(self, x: FloatArray, target: FloatArray) -> Observations:
+        raise NotImplementedError
+
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
+        super().reset(slots, contexts, seeds)
+        return self.observe(self._x[slots], self._target[slots])
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        step = super().step(actions)
+        shown = self.observe(self._x, self._target)
+        return dataclasses.replace(step, observations=shown, truncated=self._time >= self.horizon)
+
+
+class Image(Shown):
+    """A picture: the target is a bright column, the position one half as bright."""
+
+    def __init__(self, n_slots: int, discrete: bool) -> None:
+        super().__init__(n_slots, discrete)
+        self.observation_space = spaces.Box(0, 255, shape=(1, PIXELS, PIXELS), dtype=np.uint8)
+
+    def observe(self, x: FloatArray, target: FloatArray) -> Observations:
+        pictures = np.zeros((len(x), 1, PIXELS, PIXELS), dtype=np.uint8)
+        for places, brightness in ((x, 127), (target, 255)):
+            columns = np.round((places + 1.0) / 2.0 * (PIXELS - 1)).astype(np.int64)
+            pictures[np.arange(len(x)), 0, :, columns] = brightness
+        return pictures
+
+
+def make_image(n_slots: int, discrete: bool = True) -> Image:
+    return Image(n_slots, discrete)
+
+
+class Parts(Shown):
+    """A dictionary: the position, and the way to the target with its sign."""
+
+    def __init__(self, n_slots: int, discrete: bool) -> None:
+        super().__init__(n_slots, discrete)
+        self.observation_space = spaces.Dict(
+            {
+                "position": spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32),
+                "way": spaces.Box(-2.0, 2.0, shape=(2,), dtype=np.float32),
+            }
+        )
+
+    def observe(self, x: FloatArray, target: FloatArray) -> Observations:
+        way = target - x
+        return {
+            "position": x[:, None].astype(np.float32),
+            "way": np.stack([way, np.sign(way)], axis=1).astype(np.float32),
+        }
+
+
+def make_dict(n_slots: int, discrete: bool = False) -> Parts:
+    return Parts(n_slots, discrete)

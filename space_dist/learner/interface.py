@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 
 from space_dist.config import LearnerConfig
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.learner.networks import is_mlp, torch_policy
+from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.policy import Policy, Statistics
 from space_dist.rollout import Shard
@@ -219,13 +219,7 @@ def _refuse_spaces(
 ) -> None:
     kind = config.kind
     flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
-    if config.policy == "MlpPolicy" and not flat:
-        raise ConfigError(
-            f"learner.policy: MlpPolicy needs flat observations (a one-dimensional Box), not {observation_space}; "
-            "CnnPolicy takes images, MultiInputPolicy dictionaries"
-        )
-    if isinstance(observation_space, spaces.Dict) and config.policy in ("MlpPolicy", "CnnPolicy"):
-        raise ConfigError(f"learner.policy: {config.policy} takes no dictionary observations; use MultiInputPolicy")
+    refuse_policy(config, observation_space)
     if config.normalize_observations and not flat:
         raise ConfigError("learner.normalize_observations: only flat observations can be normalised")
     continuous = isinstance(action_space, spaces.Box) and len(action_space.shape) == 1

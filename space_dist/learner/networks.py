@@ -15,6 +15,10 @@ from sb3_contrib import TRPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
 
 from space_dist.config import DQNConfig, LearnerConfig
 from space_dist.envs import Observations
@@ -24,6 +28,13 @@ from space_dist.policy import Array, Head, Layers, Statistics
 ALGORITHMS: dict[str, Any] = {
     "ppo": PPO, "trpo": TRPO, "a2c": A2C, "dqn": DQN, "sac": SAC, "td3": TD3,
 }  # fmt: skip
+
+
+_BASES: dict[str, type[BasePolicy]] = {
+    "ppo": ActorCriticPolicy, "trpo": ActorCriticPolicy, "a2c": ActorCriticPolicy,
+    "dqn": DQNPolicy, "sac": SACPolicy, "td3": TD3Policy,
+}  # fmt: skip
+_LEAST_IMAGE = 36  # pixels: what the convolutions of SB3's NatureCNN leave something of
 
 
 def is_mlp(config: LearnerConfig, observation_space: spaces.Space[Any]) -> bool:
@@ -56,6 +67,35 @@ def policy_class(config: LearnerConfig) -> str | type[BasePolicy]:
     if not (isinstance(found, type) and issubclass(found, BasePolicy)):
         raise ConfigError(f"learner.policy {config.policy!r}: {name!r} is no Stable-Baselines3 policy class")
     return found
+
+
+def refuse_policy(config: LearnerConfig, observation_space: spaces.Space[Any]) -> None:
+    """Raise ConfigError if SB3 cannot build this policy for these observations."""
+    found, bases = policy_class(config), _BASES[config.kind]
+    if not isinstance(found, str):
+        if not issubclass(found, bases):
+            raise ConfigError(f"learner.policy {config.policy!r} is no policy of {config.kind}: no {bases.__name__}")
+        return
+    parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+    flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
+    if found == "MlpPolicy" and not flat:
+        raise ConfigError(
+            f"learner.policy: MlpPolicy needs flat observations (a one-dimensional Box), not {observation_space}; "
+            "CnnPolicy takes images, MultiInputPolicy dictionaries"
+        )
+    if (found == "MultiInputPolicy") != isinstance(observation_space, spaces.Dict):
+        raise ConfigError(f"learner.policy: dictionaries need MultiInputPolicy, and nothing else: {observation_space}")
+    for name, part in parts.items():
+        image = is_image_space(part)
+        if found == "CnnPolicy" and not image:
+            raise ConfigError(f"learner.policy: CnnPolicy needs images (uint8, 0 to 255), not {part}")
+        ordered = isinstance(part, spaces.Box) and image and is_image_space_channels_first(part)
+        if image and (not ordered or min((part.shape or (0,))[-2:]) < _LEAST_IMAGE):
+            what = f"part {name!r} of the observations" if name else "observations"
+            raise ConfigError(
+                f"learner.policy: images must be (channels, height, width), at least {_LEAST_IMAGE} pixels each way; "
+                f"{what}: {part}"
+            )
 
 
 def layers(state: Mapping[str, torch.Tensor], body: str, *heads: str) -> Layers:
@@ -168,5 +208,5 @@ def _network(policy: TorchPolicy) -> BasePolicy:
 def tensors(observations: Observations) -> Any:
     """Observations as SB3's policies take them."""
     if isinstance(observations, dict):
-        return {name: torch.as_tensor(np.ascontiguousarray(array)) for name, array in observations.items()}
-    return torch.as_tensor(np.ascontiguousarray(observations))
+        return {name: torch.tensor(array) for name, array in observations.items()}
+    return torch.tensor(observations)  # a copy: what comes from Ray's object store is read-only

@@ -10,11 +10,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from space_dist.envs import Observations
 from space_dist.policy import Statistics
 from space_dist.rollout import Shard
 
 REWARD_CLIP = 10.0  # of normalised rewards; SB3's VecNormalize
 FloatArray = NDArray[np.float64]
+_ROUNDING = 1e-9  # share of a mean below which a deviation is an error of summation
 
 
 @dataclass
@@ -40,9 +42,10 @@ class _Moments:
 
     @property
     def std(self) -> FloatArray:
-        """Standard deviations; 1 where there is no variation. No constant is added: scaling must leave no trace."""
+        """Standard deviations; 1 where nothing varies but the last bits. Nothing is added: scaling leaves no trace."""
         variance = self.squares / max(self.count, 1.0)
-        return np.where(variance > 0.0, np.sqrt(np.where(variance > 0.0, variance, 1.0)), 1.0)
+        varies = variance > (_ROUNDING * self.mean) ** 2
+        return np.where(varies, np.sqrt(np.where(varies, variance, 1.0)), 1.0)
 
 
 class Normaliser:
@@ -90,12 +93,9 @@ class Normaliser:
             one.count = float(arrays[f"{name}_count"])
             one.mean, one.squares = arrays[f"{name}_mean"].copy(), arrays[f"{name}_squares"].copy()
 
-    def normalize_obs(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """What SB3's replay buffer calls when it samples."""
-        scaled = self.statistics.scaled(observations)
-        if isinstance(scaled, dict):
-            raise TypeError("dictionaries are not normalised")
-        return scaled
+    def normalize_obs(self, observations: Observations) -> Observations:
+        """What SB3's replay buffer calls when it samples; dictionaries come back as they are."""
+        return self.statistics.scaled(observations)
 
     def normalize_reward(self, rewards: NDArray[Any]) -> NDArray[np.float32]:
         """What SB3's replay buffer calls when it samples, and `fill` for rollouts."""
