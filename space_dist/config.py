@@ -336,6 +336,7 @@ class SACConfig(_OffPolicy):
     """Entropy coefficient alpha; auto: learned. Source: SB3."""
     target_update_interval: int = Field(default=1, ge=1)
     """Gradient steps between updates of the target network. Source: SB3."""
+
     @field_validator("ent_coef")
     @classmethod
     def _not_negative(cls, value: str | float) -> str | float:
@@ -427,6 +428,7 @@ class TrackingConfig(_Section):
     """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; null: none."""
     experiment: str = Field(default="space_dist", min_length=1, max_length=200)
     """MLflow experiment."""
+
     @field_validator("uri")
     @classmethod
     def _known_kind(cls, value: str | None) -> str | None:
@@ -730,9 +732,7 @@ def _explain(fault: Any, source: str, origins: Mapping[str, str]) -> str:
         path.append("kind")
     key = ".".join(path)
     related = (
-        origin
-        for name, origin in origins.items()
-        if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
+        origin for name, origin in origins.items() if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
     )
     where = next(related, source)
     kind, given = fault["type"], fault.get("input")
@@ -784,9 +784,7 @@ def _locate(location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel]
 
 def _models(field: Any) -> list[type[BaseModel]]:
     annotations = (
-        get_args(field.annotation)
-        if get_origin(field.annotation) in (Union, types.UnionType)
-        else [field.annotation]
+        get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else [field.annotation]
     )
     return [annotation for annotation in annotations
             if isinstance(annotation, type) and issubclass(annotation, BaseModel)]  # fmt: skip

@@ -48,15 +48,18 @@ class ContextBounds:
             usable = np.isfinite(high - low) & (low < high)
         if not usable.all():
             bad = int(np.argmin(usable))
-            raise ConfigError(f"feature {_shown(self.names[bad])} has bounds [{low[bad]}, {high[bad]}]: "
-                              "they must be finite, the lower below the higher")
+            raise ConfigError(
+                f"feature {_shown(self.names[bad])} has bounds [{low[bad]}, {high[bad]}]: "
+                "they must be finite, the lower below the higher"
+            )
         _freeze(self, low=low, high=high)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ContextBounds):
             return NotImplemented
-        return (self.names == other.names and np.array_equal(self.low, other.low)
-                and np.array_equal(self.high, other.high))
+        return (
+            self.names == other.names and np.array_equal(self.low, other.low) and np.array_equal(self.high, other.high)
+        )
 
     def __hash__(self) -> int:
         return hash((self.names, self.low.tobytes(), self.high.tobytes()))
@@ -89,8 +92,10 @@ class InstanceSet:
         given = np.asarray(self.ids)
         contexts = np.asarray(self.contexts, dtype=np.float64)
         if contexts.ndim != 2 or given.shape != contexts.shape[:1] or contexts.shape[1] != len(self.names):
-            raise ConfigError(f"ids of shape {given.shape}, contexts of shape {contexts.shape} and {len(self.names)} "
-                              "feature names do not make an instance set")
+            raise ConfigError(
+                f"ids of shape {given.shape}, contexts of shape {contexts.shape} and {len(self.names)} "
+                "feature names do not make an instance set"
+            )
         if not len(given):
             raise ConfigError("an instance set needs at least one instance")
         if not np.issubdtype(given.dtype, np.integer):
@@ -99,8 +104,10 @@ class InstanceSet:
             raise ConfigError(f"ids must be between 0 and {MAX_ID}, not {given.min()} to {given.max()}")
         if not np.isfinite(contexts).all():
             row, feature = np.argwhere(~np.isfinite(contexts))[0]
-            raise ConfigError(f"instance {given[row]} has {_shown(self.names[feature])} = {contexts[row, feature]}: "
-                              "contexts must be finite")
+            raise ConfigError(
+                f"instance {given[row]} has {_shown(self.names[feature])} = {contexts[row, feature]}: "
+                "contexts must be finite"
+            )
         order = np.argsort(given, kind="stable")
         ids = given[order].astype(np.int64)
         if (repeated := np.flatnonzero(ids[1:] == ids[:-1])).size:
@@ -114,8 +121,11 @@ class InstanceSet:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, InstanceSet):
             return NotImplemented
-        return (self.names == other.names and np.array_equal(self.ids, other.ids)
-                and np.array_equal(self.contexts, other.contexts))
+        return (
+            self.names == other.names
+            and np.array_equal(self.ids, other.ids)
+            and np.array_equal(self.contexts, other.contexts)
+        )
 
     def __hash__(self) -> int:
         return hash((self.names, self.ids.tobytes(), self.contexts.tobytes()))
@@ -172,17 +182,23 @@ def refuse_overlap(train: InstanceSet, test: InstanceSet, train_name: str, test_
     Also raised if the sets have different features: then nothing could be compared.
     """
     if train.names != test.names:
-        raise ConfigError(f"{train_name} and {test_name} have different features: "
-                          f"{_cut(', '.join(train.names), 120)} and {_cut(', '.join(test.names), 120)}")
+        raise ConfigError(
+            f"{train_name} and {test_name} have different features: "
+            f"{_cut(', '.join(train.names), 120)} and {_cut(', '.join(test.names), 120)}"
+        )
     first, second = _repeats(np.vstack((train.contexts, test.contexts)))
     crossing = (first < len(train)) & (second >= len(train))
     if crossing.any():
         train_ids, test_ids = train.ids[first[crossing]], test.ids[second[crossing] - len(train)]
-        pairs = [f"id {a} of {train_name} is id {b} of {test_name}"
-                 for a, b in zip(train_ids[:3].tolist(), test_ids[:3].tolist(), strict=True)]
+        pairs = [
+            f"id {a} of {train_name} is id {b} of {test_name}"
+            for a, b in zip(train_ids[:3].tolist(), test_ids[:3].tolist(), strict=True)
+        ]
         more = f" and {len(train_ids) - 3} more" if len(train_ids) > 3 else ""
-        raise ConfigError(f"training and test instances overlap: {', '.join(pairs)}{more}. A policy must be tested "
-                          "on contexts it was not trained on")
+        raise ConfigError(
+            f"training and test instances overlap: {', '.join(pairs)}{more}. A policy must be tested "
+            "on contexts it was not trained on"
+        )
 
 
 def summary(instances: InstanceSet, bounds: ContextBounds) -> list[tuple[str, float, float, float]]:
@@ -191,8 +207,10 @@ def summary(instances: InstanceSet, bounds: ContextBounds) -> list[tuple[str, fl
     Raises ConfigError if the set does not have the features of `bounds`.
     """
     if instances.names != bounds.names:
-        raise ConfigError(f"the set's features are {_cut(', '.join(instances.names), 120)}, "
-                          f"the environment's are {_cut(', '.join(bounds.names), 120)}")
+        raise ConfigError(
+            f"the set's features are {_cut(', '.join(instances.names), 120)}, "
+            f"the environment's are {_cut(', '.join(bounds.names), 120)}"
+        )
     lowest, mean, highest = (of(instances.contexts, axis=0).tolist() for of in (np.min, np.mean, np.max))
     return list(zip(instances.names, lowest, mean, highest, strict=True))
 
@@ -271,8 +289,10 @@ def _read_rows(
     """
     ids, values = array("q"), array("d")
     id_position = columns.index("id")
-    features = [(columns.index(name), low, high)
-                for name, low, high in zip(bounds.names, bounds.low.tolist(), bounds.high.tolist(), strict=True)]
+    features = [
+        (columns.index(name), low, high)
+        for name, low, high in zip(bounds.names, bounds.low.tolist(), bounds.high.tolist(), strict=True)
+    ]
     for row, line in _lines(file, first_row=2):
         if not line:
             _refuse_more(file, row)
@@ -281,8 +301,10 @@ def _read_rows(
             raise ConfigError(f"holds more than {MAX_INSTANCES} instances")
         cells = _split(row, line)
         if len(cells) != len(columns):
-            raise ConfigError(f"row {row} has {len(cells)} cells where row 1 names {len(columns)} columns "
-                              f"({_cut(', '.join(columns), 200)}): {_shown(line)}")
+            raise ConfigError(
+                f"row {row} has {len(cells)} cells where row 1 names {len(columns)} columns "
+                f"({_cut(', '.join(columns), 200)}): {_shown(line)}"
+            )
         position = id_position
         try:
             if b"_" in line:  # Python would read 1_0 as 10
@@ -332,12 +354,15 @@ def _refuse_repeats(ids: NDArray[np.int64], contexts: NDArray[np.float64]) -> No
     """Refuse an id or a context that is there twice. Rows are `(n,)` and `(n, d)` in the order of the file."""
     first, second = _repeats(ids[:, np.newaxis])
     if second.size:
-        raise ConfigError(f"row {first[0] + 2} and row {second[0] + 2}, column 'id': both are {ids[first[0]]}; "
-                          "each id may occur once")
+        raise ConfigError(
+            f"row {first[0] + 2} and row {second[0] + 2}, column 'id': both are {ids[first[0]]}; each id may occur once"
+        )
     first, second = _repeats(contexts)
     if second.size:
-        raise ConfigError(f"row {first[0] + 2} (id {ids[first[0]]}) and row {second[0] + 2} (id {ids[second[0]]}) "
-                          "hold the same context; each context may occur once")
+        raise ConfigError(
+            f"row {first[0] + 2} (id {ids[first[0]]}) and row {second[0] + 2} (id {ids[second[0]]}) "
+            "hold the same context; each context may occur once"
+        )
 
 
 def _repeats(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -359,8 +384,10 @@ def _check_names(names: tuple[str, ...]) -> None:
         raise ConfigError("a context needs at least one feature")
     for name in names:
         if name == "id" or name != name.strip() or not name or not name.isprintable() or set(name) & set(',"'):
-            raise ConfigError(f"{_shown(name)} cannot name a feature: names are printable, neither 'id' nor empty, "
-                              "without commas, double quotes or surrounding spaces")
+            raise ConfigError(
+                f"{_shown(name)} cannot name a feature: names are printable, neither 'id' nor empty, "
+                "without commas, double quotes or surrounding spaces"
+            )
     if len(set(names)) < len(names):
         doubled = next(name for name in names if names.count(name) > 1)
         raise ConfigError(f"the feature {_shown(doubled)} is named twice")
@@ -464,12 +491,16 @@ def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[Ins
     or above 10 million together, for a negative seed, and if there are not that many distinct contexts to be found.
     """
     if distribution not in DISTRIBUTIONS:
-        raise ConfigError(f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], DISTRIBUTIONS)} "
-                          f"(known are {', '.join(DISTRIBUTIONS)})")
+        raise ConfigError(
+            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], DISTRIBUTIONS)} "
+            f"(known are {', '.join(DISTRIBUTIONS)})"
+        )
     total = n_train + n_test
     if min(n_train, n_test) < 1 or total > MAX_INSTANCES:
-        raise ConfigError(f"cannot sample {n_train} training and {n_test} test instances: at least 1 of each, "
-                          f"at most {MAX_INSTANCES} together")
+        raise ConfigError(
+            f"cannot sample {n_train} training and {n_test} test instances: at least 1 of each, "
+            f"at most {MAX_INSTANCES} together"
+        )
     if seed < 0:
         raise ConfigError(f"the seed {seed} is negative; allowed are whole numbers from 0")
     chosen = DISTRIBUTIONS[distribution]

@@ -533,10 +533,10 @@ def _believed_alive(owner: Mapping[str, Any]) -> bool:
 def _started(pid: int) -> int | None:
     """When a living process began, in clock ticks since boot: unlike a time of day, no clock setting changes it."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:
         return None
-    return None if fields[0] == "Z" else int(fields[19])
+    return None if fields[0] == b"Z" else int(fields[19])
 
 
 class _Lock:
@@ -583,7 +583,12 @@ class _Lock:
                     "Wait for it to end, or stop it; if it is on a machine that died, its claim ends "
                     f"{LEASE_SECONDS:.0f} s after its last sign of life"
                 )
-            self._write(file)
+            try:
+                self._write(file)
+            except OSError:  # a claim that may not be on disk is none: whoever tries again must not meet it
+                with contextlib.suppress(OSError):
+                    file.truncate(0)
+                raise
         self._thread = threading.Thread(target=self._beat, name="lock-heartbeat", daemon=True)
         self._thread.start()
 

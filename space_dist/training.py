@@ -187,9 +187,7 @@ class Training:
         policy = self._restore(checkpoint) if checkpoint else self._begin()
         while not self._is_over():
             shards: list[Shard] = self._wait_for(
-                cluster.collect(
-                    policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version
-                )
+                cluster.collect(policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version)
             )
             steps = run.steps + sum(shard.steps for shard in shards)
             update = self.learner.update(shards, round=run.round, steps=steps)

@@ -22,8 +22,7 @@ def train(out: Path, learner: str, *arguments: str, seed: int = 0, workers: int 
     settings = ["budget.steps=20000", "tracking.uri=null", "checkpoint.every_rounds=1"]
     if learner == "trpo":  # the shipped config is PPO's: what only PPO has goes
         settings.append(
-            "learner={kind: trpo, n_steps: 2048, gamma: 0.95, gae_lambda: 0.99, net_arch: [64, 64], "
-            "target_kl: 0.004}"
+            "learner={kind: trpo, n_steps: 2048, gamma: 0.95, gae_lambda: 0.99, net_arch: [64, 64], target_kl: 0.004}"
         )
     command = [sys.executable, "-m", "space_dist.cli", "train", str(ROOT / "configs/pointmass_space.yaml")]
     command += ["--out", str(out), "--seed", str(seed), "--workers", str(workers), *arguments]

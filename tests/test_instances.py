@@ -41,7 +41,8 @@ instance_sets = st.lists(
         st.integers(0, 2**63 - 1),
         st.tuples(*[st.floats(-1e300, 1e300, allow_nan=False)] * 2),
     ),
-    min_size=1, max_size=12,
+    min_size=1,
+    max_size=12,
     unique_by=(lambda row: row[0], lambda row: row[1]),  # -0.0 == 0.0 here too
 ).map(lambda rows: InstanceSet(np.array([i for i, _ in rows]), np.array([c for _, c in rows]), WIDE.names))
 
@@ -97,16 +98,20 @@ def test_canonical_text_and_digest_are_fixed() -> None:
     assert instances.digest() == "c641707b66816e2374fef9f1acd8a608bfa498fb5375c6b536d6bb4f78ce6dc6"
 
 
-@pytest.mark.parametrize("content", [
-    VALID,
-    VALID.rstrip("\n"),
-    "\ufeff" + VALID,
-    VALID.replace("\n", "\r\n"),
-    VALID + "\n\n  \n\t\r\n",
-    VALID.replace(",", " , "),
-    VALID.replace("1.0,2.0", " 1 ,\t2e0"),
-    '"id","gate_x","gate_width","friction"\n"0","1.0","2.0",3.0\n1, "1.5" ,2.5,3.5\n2,-1.0,0.5,-0.0\n',
-], ids=["as written", "no last line end", "BOM", "CRLF", "blank end", "spaces", "other spellings", "quoted"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        VALID,
+        VALID.rstrip("\n"),
+        "\ufeff" + VALID,
+        VALID.replace("\n", "\r\n"),
+        VALID + "\n\n  \n\t\r\n",
+        VALID.replace(",", " , "),
+        VALID.replace("1.0,2.0", " 1 ,\t2e0"),
+        '"id","gate_x","gate_width","friction"\n"0","1.0","2.0",3.0\n1, "1.5" ,2.5,3.5\n2,-1.0,0.5,-0.0\n',
+    ],
+    ids=["as written", "no last line end", "BOM", "CRLF", "blank end", "spaces", "other spellings", "quoted"],
+)
 def test_accepted_spellings(tmp_path: Path, content: str) -> None:
     expected = InstanceSet(np.arange(3), np.array([[1, 2, 3], [1.5, 2.5, 3.5], [-1, 0.5, 0]]), BOUNDS.names)
     assert read_csv(written(tmp_path, content), BOUNDS) == expected
@@ -236,9 +241,36 @@ def test_more_instances_than_anyone_means(tmp_path: Path, monkeypatch: pytest.Mo
 # ---- files nobody thought of
 
 JUNK = [
-    b"", b" ", b"\0", b"\r", b"\n", b",", b"1;2", b'"', b'""', b'"1"', b"\xff\xfe", b"\xef\xbb\xbf", b"\x1b[31m",
-    b"\xe2\x80\xae", b"\xf0\x9f\x92\xa9", b"nan", b"inf", b"None", b"=1+1", b"id", b"0", b"-0.0", b"-1", b"1.0.0",
-    b"1_0", b"0x10", b"1e400", b"1e-400", b"9" * 5000, b"18446744073709551616",
+    b"",
+    b" ",
+    b"\0",
+    b"\r",
+    b"\n",
+    b",",
+    b"1;2",
+    b'"',
+    b'""',
+    b'"1"',
+    b"\xff\xfe",
+    b"\xef\xbb\xbf",
+    b"\x1b[31m",
+    b"\xe2\x80\xae",
+    b"\xf0\x9f\x92\xa9",
+    b"nan",
+    b"inf",
+    b"None",
+    b"=1+1",
+    b"id",
+    b"0",
+    b"-0.0",
+    b"-1",
+    b"1.0.0",
+    b"1_0",
+    b"0x10",
+    b"1e400",
+    b"1e-400",
+    b"9" * 5000,
+    b"18446744073709551616",
 ]
 
 
@@ -269,8 +301,11 @@ def shuffle_columns(table: list[list[bytes]], row: int, column: int, _: bytes) -
 
 MUTATIONS = [put_cell, drop_cell, drop_row, double_row, shuffle_columns]
 mutated = st.tuples(
-    st.lists(st.tuples(st.sampled_from(MUTATIONS), st.integers(0, 3), st.integers(0, 3), st.sampled_from(JUNK)),
-             min_size=1, max_size=3),
+    st.lists(
+        st.tuples(st.sampled_from(MUTATIONS), st.integers(0, 3), st.integers(0, 3), st.sampled_from(JUNK)),
+        min_size=1,
+        max_size=3,
+    ),
     st.one_of(st.none(), st.integers(0, len(VALID))),
 )
 Mutation = Callable[[list[list[bytes]], int, int, bytes], None]
@@ -328,37 +363,43 @@ def test_bounds_scale() -> None:
             BOUNDS.scale(np.zeros(shape))
 
 
-@pytest.mark.parametrize(("names", "low", "high", "said"), [
-    ((), [], [], "at least one feature"),
-    (("a", "a"), [0, 0], [1, 1], "'a' is named twice"),
-    (("id",), [0], [1], "'id' cannot name a feature"),
-    (("a,b",), [0], [1], "'a,b' cannot name a feature"),
-    ((" a",), [0], [1], "cannot name a feature"),
-    (("",), [0], [1], "cannot name a feature"),
-    (("a\nb",), [0], [1], "cannot name a feature"),
-    (("a",), [0, 0], [1], "shapes"),
-    (("a",), [1], [1], r"'a' has bounds \[1.0, 1.0\]"),
-    (("a", "b"), [0, 2], [1, 1], r"'b' has bounds \[2.0, 1.0\]"),
-    (("a",), [0], [math.inf], "must be finite"),
-    (("a",), [math.nan], [1], "must be finite"),
-    (("a",), [-1e308], [1e308], "must be finite"),  # their distance is not
-])
+@pytest.mark.parametrize(
+    ("names", "low", "high", "said"),
+    [
+        ((), [], [], "at least one feature"),
+        (("a", "a"), [0, 0], [1, 1], "'a' is named twice"),
+        (("id",), [0], [1], "'id' cannot name a feature"),
+        (("a,b",), [0], [1], "'a,b' cannot name a feature"),
+        ((" a",), [0], [1], "cannot name a feature"),
+        (("",), [0], [1], "cannot name a feature"),
+        (("a\nb",), [0], [1], "cannot name a feature"),
+        (("a",), [0, 0], [1], "shapes"),
+        (("a",), [1], [1], r"'a' has bounds \[1.0, 1.0\]"),
+        (("a", "b"), [0, 2], [1, 1], r"'b' has bounds \[2.0, 1.0\]"),
+        (("a",), [0], [math.inf], "must be finite"),
+        (("a",), [math.nan], [1], "must be finite"),
+        (("a",), [-1e308], [1e308], "must be finite"),  # their distance is not
+    ],
+)
 def test_bounds_refused(names: tuple[str, ...], low: list[float], high: list[float], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         ContextBounds(names, np.array(low), np.array(high))
 
 
-@pytest.mark.parametrize(("ids", "contexts", "said"), [
-    ([], np.empty((0, 2)), "at least one instance"),
-    ([0, 0], [[1, 2], [3, 4]], "two instances have the id 0"),
-    ([-1, 0], [[1, 2], [3, 4]], "between 0 and"),
-    ([0.0, 1.0], [[1, 2], [3, 4]], "whole numbers"),
-    ([0, 1], [[1, 2], [3, math.nan]], "instance 1 has 'b' = nan"),
-    ([0], [[1, 2], [3, 4]], "do not make an instance set"),
-    ([0, 1], [[1], [3]], "do not make an instance set"),
-    ([0, 1], [1, 2], "do not make an instance set"),
-    (np.array([0, 2**63], dtype=np.uint64), [[1, 2], [3, 4]], "between 0 and"),
-])
+@pytest.mark.parametrize(
+    ("ids", "contexts", "said"),
+    [
+        ([], np.empty((0, 2)), "at least one instance"),
+        ([0, 0], [[1, 2], [3, 4]], "two instances have the id 0"),
+        ([-1, 0], [[1, 2], [3, 4]], "between 0 and"),
+        ([0.0, 1.0], [[1, 2], [3, 4]], "whole numbers"),
+        ([0, 1], [[1, 2], [3, math.nan]], "instance 1 has 'b' = nan"),
+        ([0], [[1, 2], [3, 4]], "do not make an instance set"),
+        ([0, 1], [[1], [3]], "do not make an instance set"),
+        ([0, 1], [1, 2], "do not make an instance set"),
+        (np.array([0, 2**63], dtype=np.uint64), [[1, 2], [3, 4]], "between 0 and"),
+    ],
+)
 def test_instance_set_refused(ids: list[int], contexts: list[list[float]], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         InstanceSet(np.array(ids), np.array(contexts), ("a", "b"))
@@ -474,9 +515,11 @@ def test_moments_of_the_target_distribution() -> None:
 
 
 def test_repeated_draws_are_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    dice = replace(DISTRIBUTIONS["pointmass_uniform"],
-                   bounds=ContextBounds(("side",), np.array([0.0]), np.array([5.0])),
-                   draw=lambda rng, n: rng.integers(0, 6, (n, 1)).astype(float))
+    dice = replace(
+        DISTRIBUTIONS["pointmass_uniform"],
+        bounds=ContextBounds(("side",), np.array([0.0]), np.array([5.0])),
+        draw=lambda rng, n: rng.integers(0, 6, (n, 1)).astype(float),
+    )
     monkeypatch.setattr(module, "DISTRIBUTIONS", {"dice": dice})
     train, test = sample("dice", 4, 2, seed=0)
     assert sorted([*train.contexts[:, 0], *test.contexts[:, 0]]) == [0, 1, 2, 3, 4, 5]
@@ -484,13 +527,22 @@ def test_repeated_draws_are_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None
         sample("dice", 4, 3, seed=0)
 
 
-@pytest.mark.parametrize(("name", "n_train", "n_test", "seed", "said"), [
-    ("pointmass_unifrom", 1, 1, 0, r"did you mean 'pointmass_uniform'\? \(known are pointmass_uniform, pointmass_t"),
-    ("pointmass_uniform", 0, 1, 0, "cannot sample 0 training and 1 test"),
-    ("pointmass_uniform", 1, 0, 0, "at least 1 of each"),
-    ("pointmass_uniform", 10**12, 1, 0, "at most 10000000 together"),
-    ("pointmass_uniform", 1, 1, -1, "the seed -1 is negative"),
-])
+@pytest.mark.parametrize(
+    ("name", "n_train", "n_test", "seed", "said"),
+    [
+        (
+            "pointmass_unifrom",
+            1,
+            1,
+            0,
+            r"did you mean 'pointmass_uniform'\? \(known are pointmass_uniform, pointmass_t",
+        ),
+        ("pointmass_uniform", 0, 1, 0, "cannot sample 0 training and 1 test"),
+        ("pointmass_uniform", 1, 0, 0, "at least 1 of each"),
+        ("pointmass_uniform", 10**12, 1, 0, "at most 10000000 together"),
+        ("pointmass_uniform", 1, 1, -1, "the seed -1 is negative"),
+    ],
+)
 def test_sampling_refused(name: str, n_train: int, n_test: int, seed: int, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         sample(name, n_train, n_test, seed)

@@ -52,8 +52,17 @@ def start_run(
     with RunWriter(Ledger(folder)) as writer:
         writer.write_config(to_yaml(config), f"id,gate\n{train}", f"id,gate\n{test}")
         writer.set_status(
-            Status("running", name, seed, 0, 4 * STEPS, 0, STARTED + seed, STARTED + seed,
-                   fingerprint={"cpu": "test", "torch": "2.0"})
+            Status(
+                "running",
+                name,
+                seed,
+                0,
+                4 * STEPS,
+                0,
+                STARTED + seed,
+                STARTED + seed,
+                fingerprint={"cpu": "test", "torch": "2.0"},
+            )
         )
     return Ledger(folder)
 

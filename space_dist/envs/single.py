@@ -31,9 +31,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self.context_names = bounds.names
         self._context: NDArray[np.float64] | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; `seed` alone decides its noise. Raises ValueError for a context outside its bounds."""
         super().reset(seed=seed)
         if options is not None and "context" in options:

@@ -55,9 +55,7 @@ class Normaliser:
     return, which starts anew with each episode.
     """
 
-    def __init__(
-        self, observation_space: spaces.Space[Any], gamma: float, observations: bool, rewards: bool
-    ) -> None:
+    def __init__(self, observation_space: spaces.Space[Any], gamma: float, observations: bool, rewards: bool) -> None:
         self._gamma, self._observations, self._rewards = gamma, observations, rewards
         self._seen = _Moments.empty(*(observation_space.shape or ()))
         self._returns = _Moments.empty()

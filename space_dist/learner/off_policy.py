@@ -265,5 +265,3 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], name: str) -> Observations:
         return arrays[name]
     prefix = f"{name}."
     return {part.removeprefix(prefix): array for part, array in arrays.items() if part.startswith(prefix)}
-
-
