@@ -69,14 +69,14 @@ def train(
     """Train one policy under one curriculum."""
     STOP.install()
     from space_dist import config as configs
-    from space_dist.launch import default_folder, launch
+    from space_dist.launch import about, default_folder, launch
 
     settings = list(overrides or [])
     if workers is not None:
         settings.append(f"resources.workers={workers}")
     run = configs.load(config, settings, seed=seed)
     folder = out if out is not None else default_folder(run)
-    with _display(run.name, run.seed) as observe:
+    with about(str(config)), _display(run.name, run.seed) as observe:
         outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe)
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
@@ -270,11 +270,12 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
-    from space_dist.launch import read_instances
+    from space_dist.launch import about, read_instances
     from space_dist.training import make_setup
 
     run = configs.load(config, list(overrides or []))
-    make_setup(run, *read_instances(run))
+    with about(str(config)):
+        make_setup(run, *read_instances(run))
     print(configs.dump(run), end="")
 
 
@@ -327,6 +328,14 @@ def main() -> None:
         for line in str(error).splitlines():
             errors.print(f"space-dist: {line}", highlight=False, markup=False, soft_wrap=True)
         sys.exit(error.exit_code)
+    except Exception as error:
+        # Nobody wants a traceback on their terminal; who does says so.
+        if os.environ.get("SPACE_DIST_TRACEBACK"):
+            raise
+        what = f"{type(error).__name__}: {str(error)[:300]}"
+        hint = "SPACE_DIST_TRACEBACK=1 shows where"
+        errors.print(f"space-dist: unexpected: {what} ({hint})", highlight=False, markup=False, soft_wrap=True)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

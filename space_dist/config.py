@@ -706,7 +706,7 @@ def _plain(value: Any, path: tuple[str, ...] = ()) -> Any:
 def _apply(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
-    if not equals or not all(parts):
+    if not equals or not all(parts) or not override.isprintable():
         raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
     value = _parse_yaml(text, f"--set {override}")
     if parts[0] == "instances":

@@ -55,9 +55,22 @@ def default_folder(config: RunConfig) -> Path:
 def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
     """The training and test instances of a config. Raises ConfigError for a bad file, or one that shares a context."""
     bounds = make_env(config).context_bounds
-    train, test = read_csv(config.instances.train, bounds), read_csv(config.instances.test, bounds)
+    with about("instances.train"):
+        train = read_csv(config.instances.train, bounds)
+    with about("instances.test"):
+        test = read_csv(config.instances.test, bounds)
     refuse_overlap(train, test, str(config.instances.train), str(config.instances.test))
     return train, test
+
+
+@contextlib.contextmanager
+def about(where: str) -> Iterator[None]:
+    """Say where a fault lies: the file or key goes before its sentence, unless it is there already."""
+    try:
+        yield
+    except ConfigError as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith((where, "--set ")) else f"{where}: {text}") from error
 
 
 def launch(

@@ -33,7 +33,7 @@ from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
-from space_dist.learner import Arrays, Learner, Update, make_learner
+from space_dist.learner import Arrays, Learner, Update, make_learner, refuse_spaces
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
 from space_dist.policy import MlpPolicy, Policy, blind, to_arrays
 from space_dist.rollout import (
@@ -84,6 +84,8 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
             f"* {config.rollout.slots}) = {setup.slot_length} steps per slot, less than the horizon of "
             f"{config.env.id} ({horizon}): no episode could end. Use fewer shards or slots, or larger updates"
         )
+    env = make_env(config)
+    refuse_spaces(config.learner, env.observation_space, env.action_space)
     curriculum = config.curriculum
     if (
         curriculum.kind == "space"
@@ -104,7 +106,12 @@ def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
     """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
     slots = min(len(train), _COMPARED_STARTS)
     seeds = np.zeros(slots, dtype=np.uint64)
-    starts = make_env(config, slots).reset(np.arange(slots), train.contexts[:slots], seeds)
+    try:
+        starts = make_env(config, slots).reset(np.arange(slots), train.contexts[:slots], seeds)
+    except ConfigError:
+        raise
+    except Exception as error:  # somebody else's code may raise anything
+        raise ConfigError(f"env.id {config.env.id!r}: reset failed: {type(error).__name__}: {error}") from error
     return slots > 1 and alike(starts)
 
 

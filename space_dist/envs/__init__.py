@@ -16,6 +16,7 @@ from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.errors import ConfigError, nearest
+from space_dist.instances import ContextBounds
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
@@ -55,6 +56,16 @@ def make_batched(
                if not hasattr(env, name)]  # fmt: skip
     if missing:
         raise ConfigError(f"env.id {env_id!r} made a {type(env).__name__} without {', '.join(missing)}")
+    wanted: dict[str, tuple[type, str]] = {
+        "horizon": (int, "a whole number of steps, at least 1"),
+        "context_bounds": (ContextBounds, "ContextBounds"),
+        "observation_space": (gym.spaces.Space, "a Gymnasium space"),
+        "action_space": (gym.spaces.Space, "a Gymnasium space"),
+    }
+    for name, (kind, what) in wanted.items():
+        value: Any = getattr(env, name)
+        if not isinstance(value, kind) or (name == "horizon" and value < 1):
+            raise ConfigError(f"env.id {env_id!r}: its {name} must be {what}, not {str(value)[:80]!r}")
     return ContextVisible(env) if context_visible else env
 
 

@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 
 from space_dist.config import A2CConfig, DQNConfig, LearnerConfig, PPOConfig, SACConfig, TD3Config, TRPOConfig
-from space_dist.learner.interface import Arrays, Learner, Update
+from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
 
@@ -42,4 +42,4 @@ def make_learner(
     return kinds[type(config)](config, observation_space, action_space, seed=seed, total_steps=total_steps)
 
 
-__all__ = ["Arrays", "Learner", "OffPolicyLearner", "OnPolicyLearner", "Update", "make_learner"]
+__all__ = ["Arrays", "Learner", "OffPolicyLearner", "OnPolicyLearner", "Update", "make_learner", "refuse_spaces"]

@@ -52,7 +52,7 @@ class Learner(abc.ABC):
         total_steps: int,
     ) -> None:
         self._config, self._seed, self._total_steps = config, seed, total_steps
-        _refuse_spaces(config, observation_space, action_space)
+        refuse_spaces(config, observation_space, action_space)
         self._normaliser = (
             Normaliser(observation_space, config.gamma, config.normalize_observations, config.normalize_rewards)
             if config.normalize_observations or config.normalize_rewards
@@ -214,9 +214,8 @@ def _copy(tensor: torch.Tensor) -> NDArray[Any]:
     return array
 
 
-def _refuse_spaces(
-    config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
-) -> None:
+def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Raise ConfigError if a learner cannot work with these spaces."""
     kind = config.kind
     flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
     refuse_policy(config, observation_space)
