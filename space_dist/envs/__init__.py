@@ -64,7 +64,7 @@ def make_batched(
     }
     for name, (kind, what) in wanted.items():
         value: Any = getattr(env, name)
-        if not isinstance(value, kind) or (name == "horizon" and value < 1):
+        if not isinstance(value, kind) or (name == "horizon" and env.horizon < 1):
             raise ConfigError(f"env.id {env_id!r}: its {name} must be {what}, not {str(value)[:80]!r}")
     return ContextVisible(env) if context_visible else env
 
