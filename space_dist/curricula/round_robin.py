@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from space_dist.curricula.interface import Feedback, Numbers, Selection, State
+from space_dist.curricula.interface import Feedback, Numbers, Selection, State, selection_of
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, instance_keys
 
@@ -49,9 +49,4 @@ class RoundRobin:
 
     def selection(self, state: State) -> Selection:
         """The set in the run's order; `order_version` stays, so the walk never starts over."""
-        return Selection(
-            version=state.version,
-            ids=self._instances.ids[state.selected],
-            contexts=np.take(self._instances.contexts, state.selected, axis=0),
-            order_version=state.order_version,
-        )
+        return selection_of(self._instances, state)

@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 
-from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, State
+from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, State, selection_of
 from space_dist.curricula.variants import AdaptiveEta, Growth, Mean, Members, Rank, grown, improvement, readings
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, UInt64Array, instance_keys
@@ -124,12 +124,7 @@ class Space:
 
     def selection(self, state: State) -> Selection:
         """The instances a state has selected."""
-        return Selection(
-            version=state.version,
-            ids=self._instances.ids[state.selected],
-            contexts=np.take(self._instances.contexts, state.selected, axis=0),
-            order_version=state.order_version,
-        )
+        return selection_of(self._instances, state)
 
 
 def _highest(scores: FloatArray, size: int, ties: UInt64Array) -> IntArray:
