@@ -525,7 +525,7 @@ def torch_config(name: str, folder: Path, **changes: Any) -> RunConfig:
     # A picture or a part shows the target even where the context is hidden: SPaCE may rank by it.
     return config_for(
         folder, learner, env={"id": env_id, "kwargs": kwargs, "context_visible": visible},
-        curriculum={"kind": "round_robin" if policy == "CnnPolicy" else "space"},
+        curriculum={"kind": "space"},
         rollout={"shards": 2, "slots": 2}, budget={"steps": ROUNDS * n_steps}, evaluation={"every_steps": 40},
     )  # fmt: skip
 
