@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
 from rich.table import Table
 
 from space_dist.errors import ConfigError, SpaceDistError
@@ -252,15 +254,14 @@ def config_schema() -> None:
     """Explain every key: type, default, meaning, unit and source."""
     from space_dist.config import schema
 
-    table = Table(show_lines=False, expand=True)
-    table.add_column("key", no_wrap=True, style="bold")
-    table.add_column("type and limits")
-    table.add_column("default")
-    table.add_column("meaning", ratio=1)
     for key, kind, default, text in schema():
-        table.add_row(key, kind.replace("[", r"\["), default.replace("[", r"\["), text.replace("[", r"\["),
-                      end_section=kind == "section")  # fmt: skip
-    console.print(table)
+        if kind == "section":
+            console.print(f"\n[bold]{key}[/bold]  {text}", highlight=False)
+        else:
+            about_it = kind if default == "required" else f"{kind}, default {default}"
+            required = " (required)" if default == "required" else ""
+            console.print(f"  [bold]{key}[/bold]: {escape(about_it)}{required}", highlight=False)
+            console.print(Padding(escape(text), (0, 0, 0, 6)), highlight=False)
 
 
 @config_app.command("check")

@@ -236,7 +236,7 @@ def _failures_noted(writer: RunWriter) -> Iterator[None]:
     except SpaceDistError as error:
         _note_failure(writer, str(error))
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a user's environment may even exit
         log.error("%s", traceback.format_exc())  # the traceback is for the log alone
         what = f"{type(error).__name__}: {error}"
         _note_failure(writer, what)

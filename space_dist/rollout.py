@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, Observations, make_batched
 from space_dist.envs.observations import allocate, concatenate, put, rows, take
+from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.policy import Noise, Policy
 from space_dist.seeding import Purpose, episode_seeds, generator
@@ -300,6 +301,11 @@ def evaluate(
         step = env.step(policy.head.executed(chosen))
         backward = np.where(alive, gamma * backward + step.rewards, backward)
         time += 1
+        if time == env.horizon and (alive & ~(step.terminated | step.truncated)).any():
+            raise SpaceDistError(
+                f"the environment does not end its episodes: after its horizon of {env.horizon} steps, neither "
+                "terminated nor truncated was set"
+            )
         returns += np.where(alive, step.rewards, 0.0)
         discounted += np.where(alive, discount * step.rewards, 0.0)
         lengths += alive
