@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import statistics
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, Optional
+import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
-import numpy as np
 import typer
+from benchmarks import curriculum
 from rich.console import Console
-from rich.table import Table
-from threadpoolctl import threadpool_limits
 
-import space_dist.cli  # noqa: F401 - one thread for all arithmetic, before NumPy is imported
-from space_dist import config as configs
-from space_dist.cluster import Central, InProcess
 from space_dist.errors import SpaceDistError
-from space_dist.instances import sample
-from space_dist.launch import private_ray
-from space_dist.rollout import Walk
-from space_dist.training import learner_of, make_setup
 
-ROOT = Path(__file__).resolve().parent.parent
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-console = Console()
-
-# Shares of one stock PPO update that revaluing and selecting may cost, by number of instances.
-LIMITS = {100: 0.001, 1_600: 0.002, 100_000: 0.05, 1_000_000: 0.5}
+for _benchmark in (curriculum.curriculum,):
+    app.command()(_benchmark)
 
 
 @app.callback()
@@ -38,116 +20,9 @@ def _benchmarks() -> None:
     """Speed lives here, not in tests."""
 
 
-@app.command()
-def curriculum(
-    repeats: Annotated[int, typer.Option(min=3, help="Measurements of each; the median counts.")] = 7,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
-) -> None:
-    """What SPaCE costs: revaluing and selecting among N instances, as a share of one PPO update."""
-    threadpool_limits(limits=1)
-    private_ray()
-    base = configs.load(ROOT / "configs/pointmass_space.yaml", ["tracking.uri=null"])
-    update = _ppo_update_seconds(base, repeats)
-    console.print(f"one stock PPO update (2,048 steps, minibatch 64, 10 epochs): {update:.3f} s of CPU time")
-    table = Table(title="SPaCE's own cost per iteration (median CPU time, one thread)")
-    for column in ("instances", "revalue", "select", "both", "share of an update", "at most", "transport on Ray"):
-        table.add_column(column, justify="right")
-    rows = []
-    for n_instances, limit in LIMITS.items():
-        row = _curriculum_row(base, n_instances, repeats)
-        row |= {"share": (row["revalue"] + row["select"]) / update, "limit": limit, "update": update}
-        rows.append(row)
-        table.add_row(
-            f"{n_instances:,}",
-            *(_duration(row[key]) for key in ("revalue", "select")),
-            _duration(row["revalue"] + row["select"]),
-            f"{row['share']:.3%}",
-            f"{limit:.1%}",
-            _duration(row["transport"]),
-        )
-    console.print(table)
-    console.print(
-        "Selecting is timed with the whole set selected, where it costs most. Transport: wall time of the same "
-        "decision through one rollout actor and the curriculum actor, less the CPU time of the work itself."
-    )
-    if json_file is not None:
-        json_file.write_text(json.dumps(rows, indent=1) + "\n")
-    if any(row["share"] > row["limit"] for row in rows):
-        console.print("A limit is exceeded.", style="red")
-        raise typer.Exit(1)
-
-
-def _ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
-    train, test = sample("pointmass_uniform", 100, 100, 0)
-    setup = make_setup(config, train, test)
-    cluster, learner = InProcess(config, setup), learner_of(config)
-    weights = learner.policy(0)
-    decision = cluster.begin(cluster.start_values(weights))
-    shards = cluster.collect(weights, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
-    return _median_cpu(lambda: learner.update(shards, round=0, steps=config.learner.n_steps), repeats)
-
-
-def _curriculum_row(config: configs.RunConfig, n_instances: int, repeats: int) -> dict[str, float]:
-    train, test = sample("pointmass_uniform", n_instances, 1, 0)
-    setup = make_setup(config, train, test)
-    cluster, central = InProcess(config, setup), Central(config, train)
-    weights = learner_of(config).policy(0)
-    chunks = cluster.start_values(weights)  # the first time, start observations are made and cached
-    state, _, _, before = central.begin(*chunks)
-    everything = dataclasses.replace(state, size=n_instances, selected=np.arange(n_instances))
-    noise = np.random.default_rng(0).standard_normal(n_instances)
-    changed = np.array_split(before + noise, len(chunks))
-    revalue = _median_cpu(lambda: cluster.start_values(weights), repeats)
-    select = _median_cpu(lambda: central.decide(everything, before, 0, 1, len(changed), *changed), repeats)
-    return {
-        "instances": n_instances, "revalue": revalue, "select": select,
-        "transport": max(0.0, _through_ray(config, setup, everything, before, repeats) - revalue - select),
-    }  # fmt: skip
-
-
-def _through_ray(config: configs.RunConfig, setup: Any, state: Any, before: Any, repeats: int) -> float:
-    """Median wall seconds of one decision through actors: weights out, values across, decision made."""
-    from space_dist.distributed import RayCluster
-
-    local = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 1})})
-    weights = learner_of(config).policy(0)
-    with RayCluster(local, setup) as cluster:
-        state_handle, before_handle = cluster.put(state), cluster.put(before)
-
-        def decide() -> None:
-            values = cluster.start_values(cluster.put(weights))
-            decision = cluster.decide(state_handle, before_handle, values, version=0, gradient_steps=1)
-            cluster.get([decision.numbers])
-
-        decide()
-        return _median(decide, repeats, time.perf_counter)
-
-
-def _median_cpu(work: Callable[[], object], repeats: int) -> float:
-    return _median(work, repeats, time.process_time)
-
-
-def _median(work: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
-    """Seconds per call; short calls are repeated within one measurement until the clock can resolve them."""
-    start = clock()
-    work()
-    count = max(1, int(0.05 / max(clock() - start, 1e-6)))
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        for _ in range(count):
-            work()
-        times.append((clock() - start) / count)
-    return statistics.median(times)
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds * 1e3:,.2f} ms"
-
-
 if __name__ == "__main__":
     try:
         app()
     except SpaceDistError as error:
-        console.print(f"benchmark: {error}", style="red", markup=False)
+        Console().print(f"benchmark: {error}", style="red", markup=False)
         raise SystemExit(error.exit_code) from None

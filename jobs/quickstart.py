@@ -25,7 +25,7 @@ import ray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from space_dist.cli import print_report
+from space_dist.cli.runs import print_report
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.report import build_report

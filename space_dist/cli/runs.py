@@ -1,59 +1,26 @@
-"""The command line: parse, build, call. Exit codes: 0 done, 75 stopped and resumable, 2 bad input, else failed."""
+"""Commands about runs: train, evaluate, report, sync."""
 
 from __future__ import annotations
 
-import os
-
-# ruff: noqa: E402 - what follows must happen before anything heavy is imported
-# One thread for all arithmetic, in every process of ours, before any library reads these.
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
-from space_dist.interrupts import StopRequests
-
-STOP = StopRequests()
-
 import contextlib
 import json
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 from rich.console import Console
-from rich.markup import escape
-from rich.padding import Padding
 from rich.table import Table
 
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.cli.terminal import STOP, Overrides, Runs, console, say, warn, write
 
 if TYPE_CHECKING:
     from space_dist.report import Report
     from space_dist.training import Progress
 
-app = typer.Typer(
-    name="space-dist", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-    help="Self-paced curricula for contextual reinforcement learning.",
-)  # fmt: skip
-instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
-config_app = typer.Typer(no_args_is_help=True, help="Explain and check configs.")
-app.add_typer(instances_app, name="instances")
-app.add_typer(config_app, name="config")
-
-console = Console()
-errors = Console(stderr=True)
-
 _REPORT_WIDTH = 200  # characters
 
-Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders, or folders that hold some.")]
-Overrides = Annotated[
-    Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a config key, e.g. budget.steps=20000. Repeatable."),
-]
 
-
-@app.command()
 def train(
     config: Annotated[Path, typer.Argument(help="A run's YAML file.")],
     overrides: Overrides = None,
@@ -82,15 +49,11 @@ def train(
         outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe)
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
-    console.print(
-        f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}",
-        highlight=False, markup=False, soft_wrap=True,
-    )  # fmt: skip
+    say(f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}")
     if outcome.tracking_warning:
-        errors.print(f"warning: {outcome.tracking_warning}", highlight=False, markup=False, soft_wrap=True)
+        warn(f"warning: {outcome.tracking_warning}")
 
 
-@app.command()
 def evaluate(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
     instances: Annotated[Path, typer.Option(help="CSV of the instances to evaluate on.")],
@@ -128,7 +91,7 @@ def evaluate(
     if out is not None:
         rows = zip(chosen.ids.tolist(), *(values.tolist() for values in columns), strict=True)
         lines = [f"id,{','.join(names)}", *(",".join(map(str, row)) for row in rows)]
-        _write(out, "\n".join(lines) + "\n")
+        write(out, "\n".join(lines) + "\n")
     if as_json:
         print(json.dumps({"run": str(run), "steps": status.steps, "state": status.state, "instances": str(instances),
                           "n_instances": len(chosen), **means}))  # fmt: skip
@@ -141,7 +104,6 @@ def evaluate(
     console.print(table)
 
 
-@app.command()
 def report(
     runs: Runs,
     out: Annotated[Path, typer.Option(help="Folder for the figure and the tables.")] = Path("report"),
@@ -173,7 +135,6 @@ def print_report(result: Report, to: Console) -> None:
     to.print(f"Figure and tables: {result.figure.parent}", highlight=False, soft_wrap=True)
 
 
-@app.command()
 def sync(
     runs: Runs,
     uri: Annotated[
@@ -201,91 +162,9 @@ def sync(
         highlight=False,
     )
     for folder, reason in result.failed.items():
-        errors.print(f"space-dist: {folder} is not mirrored: {reason}", highlight=False, markup=False, soft_wrap=True)
+        warn(f"space-dist: {folder} is not mirrored: {reason}")
     if result.failed:
         raise typer.Exit(1)
-
-
-@instances_app.command("sample")
-def instances_sample(
-    distribution: Annotated[str, typer.Argument(help="pointmass_uniform, pointmass_target, ...")],
-    out: Annotated[Path, typer.Option(help="Folder for <distribution>_train.csv and <distribution>_test.csv.")],
-    n_train: Annotated[int, typer.Option("--train", min=1, max=10_000_000, help="Training instances.")] = 100,
-    n_test: Annotated[int, typer.Option("--test", min=1, max=10_000_000, help="Test instances.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
-) -> None:
-    """Draw disjoint training and test instances."""
-    from space_dist.instances import sample
-
-    train_set, test_set = sample(distribution, n_train, n_test, seed)
-    for name, chosen in (("train", train_set), ("test", test_set)):
-        path = out / f"{distribution}_{name}.csv"
-        if path.exists():
-            raise ConfigError(f"{path} exists; choose another --out, or remove it")
-        _write(path, chosen.to_csv())
-        console.print(f"{path}: {len(chosen)} instances", highlight=False, markup=False, soft_wrap=True)
-
-
-@instances_app.command("check")
-def instances_check(
-    files: Annotated[list[Path], typer.Argument(help="CSV files; given two, they must not share a context.")],
-    env: Annotated[str, typer.Option(help="The environment whose contexts these are.")] = "space_dist/PointMass-v0",
-) -> None:
-    """Check instance files and show what is in them."""
-    from space_dist.envs import make_batched
-    from space_dist.instances import read_csv, refuse_overlap, summary
-
-    bounds = make_batched(env, 1, context_visible=False).context_bounds
-    sets = [read_csv(file, bounds) for file in files]
-    for index, one in enumerate(sets):
-        for other in range(index):
-            refuse_overlap(sets[other], one, str(files[other]), str(files[index]))
-    for file, one in zip(files, sets, strict=True):
-        table = Table(title=f"{file}: {len(one)} instances")
-        for name in ("feature", "least", "mean", "greatest", "bounds"):
-            table.add_column(name, justify="left" if name == "feature" else "right")
-        for row, low, high in zip(summary(one, bounds), bounds.low, bounds.high, strict=True):
-            table.add_row(row[0], *(f"{value:.4g}" for value in row[1:]), f"[{low:g}, {high:g}]")
-        console.print(table)
-
-
-@config_app.command("schema")
-def config_schema() -> None:
-    """Explain every key: type, default, meaning, unit and source."""
-    from space_dist.config import schema
-
-    for key, kind, default, text in schema():
-        if kind == "section":
-            console.print(f"\n[bold]{key}[/bold]  {text}", highlight=False)
-        else:
-            about_it = kind if default == "required" else f"{kind}, default {default}"
-            required = " (required)" if default == "required" else ""
-            console.print(f"  [bold]{key}[/bold]: {escape(about_it)}{required}", highlight=False)
-            console.print(Padding(escape(text), (0, 0, 0, 6)), highlight=False)
-
-
-@config_app.command("check")
-def config_check(
-    config: Annotated[Path, typer.Argument(help="A run's YAML file.")],
-    overrides: Overrides = None,
-) -> None:
-    """Check a config and its instance files, and print it with every default written out."""
-    from space_dist import config as configs
-    from space_dist.launch import about, read_instances
-    from space_dist.training import make_setup
-
-    run = configs.load(config, list(overrides or []))
-    with about(str(config)):
-        make_setup(run, *read_instances(run))
-    print(configs.dump(run), end="")
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
 
 
 @contextlib.contextmanager
@@ -318,26 +197,3 @@ def _display(name: str, seed: int) -> Iterator[Callable[[Progress], None]]:
             bar.update(task, completed=progress.steps, total=progress.budget_steps, line=line)
 
         yield observe
-
-
-def main() -> None:
-    """Run a command; every error that a user can cause ends it with one sentence and its exit code."""
-    sys.path.append(str(Path.cwd()))  # import paths in configs may name the user's own modules
-    try:
-        app()
-    except SpaceDistError as error:
-        for line in str(error).splitlines():
-            errors.print(f"space-dist: {line}", highlight=False, markup=False, soft_wrap=True)
-        sys.exit(error.exit_code)
-    except Exception as error:
-        # Nobody wants a traceback on their terminal; who does says so.
-        if os.environ.get("SPACE_DIST_TRACEBACK"):
-            raise
-        what = f"{type(error).__name__}: {str(error)[:300]}"
-        hint = "SPACE_DIST_TRACEBACK=1 shows where"
-        errors.print(f"space-dist: unexpected: {what} ({hint})", highlight=False, markup=False, soft_wrap=True)
-        sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,43 @@
+"""The command line: parse, build, call. Exit codes: 0 done, 75 stopped and resumable, 2 bad input, else failed."""
+
+from __future__ import annotations
+
+from space_dist.cli.terminal import warn  # isort: skip - before anything heavy
+
+import os
+import sys
+from pathlib import Path
+
+import typer
+
+from space_dist.cli import runs
+from space_dist.cli.inputs import config_app, instances_app
+from space_dist.errors import SpaceDistError
+
+app = typer.Typer(
+    name="space-dist", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    help="Self-paced curricula for contextual reinforcement learning.",
+)  # fmt: skip
+for _command in (runs.train, runs.evaluate, runs.report, runs.sync):
+    app.command()(_command)
+app.add_typer(instances_app, name="instances")
+app.add_typer(config_app, name="config")
+
+
+def main() -> None:
+    """Run a command; every error that a user can cause ends it with one sentence and its exit code."""
+    sys.path.append(str(Path.cwd()))  # import paths in configs may name the user's own modules
+    try:
+        app()
+    except SpaceDistError as error:
+        for line in str(error).splitlines():
+            warn(f"space-dist: {line}")
+        sys.exit(error.exit_code)
+    except Exception as error:
+        # Nobody wants a traceback on their terminal; who does says so.
+        if os.environ.get("SPACE_DIST_TRACEBACK"):
+            raise
+        what = f"{type(error).__name__}: {str(error)[:300]}"
+        hint = "SPACE_DIST_TRACEBACK=1 shows where"
+        warn(f"space-dist: unexpected: {what} ({hint})")
+        sys.exit(1)

@@ -1,0 +1,91 @@
+"""Commands about what a user writes: instance sets and configs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.padding import Padding
+from rich.table import Table
+
+from space_dist.cli.terminal import Overrides, console, say, write
+from space_dist.errors import ConfigError
+
+instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
+config_app = typer.Typer(no_args_is_help=True, help="Explain and check configs.")
+
+
+@instances_app.command("sample")
+def instances_sample(
+    distribution: Annotated[str, typer.Argument(help="pointmass_uniform, pointmass_target, ...")],
+    out: Annotated[Path, typer.Option(help="Folder for <distribution>_train.csv and <distribution>_test.csv.")],
+    n_train: Annotated[int, typer.Option("--train", min=1, max=10_000_000, help="Training instances.")] = 100,
+    n_test: Annotated[int, typer.Option("--test", min=1, max=10_000_000, help="Test instances.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+) -> None:
+    """Draw disjoint training and test instances."""
+    from space_dist.instances import sample
+
+    train_set, test_set = sample(distribution, n_train, n_test, seed)
+    for name, chosen in (("train", train_set), ("test", test_set)):
+        path = out / f"{distribution}_{name}.csv"
+        if path.exists():
+            raise ConfigError(f"{path} exists; choose another --out, or remove it")
+        write(path, chosen.to_csv())
+        say(f"{path}: {len(chosen)} instances")
+
+
+@instances_app.command("check")
+def instances_check(
+    files: Annotated[list[Path], typer.Argument(help="CSV files; given two, they must not share a context.")],
+    env: Annotated[str, typer.Option(help="The environment whose contexts these are.")] = "space_dist/PointMass-v0",
+) -> None:
+    """Check instance files and show what is in them."""
+    from space_dist.envs import make_batched
+    from space_dist.instances import read_csv, refuse_overlap, summary
+
+    bounds = make_batched(env, 1, context_visible=False).context_bounds
+    sets = [read_csv(file, bounds) for file in files]
+    for index, one in enumerate(sets):
+        for other in range(index):
+            refuse_overlap(sets[other], one, str(files[other]), str(files[index]))
+    for file, one in zip(files, sets, strict=True):
+        table = Table(title=f"{file}: {len(one)} instances")
+        for name in ("feature", "least", "mean", "greatest", "bounds"):
+            table.add_column(name, justify="left" if name == "feature" else "right")
+        for row, low, high in zip(summary(one, bounds), bounds.low, bounds.high, strict=True):
+            table.add_row(row[0], *(f"{value:.4g}" for value in row[1:]), f"[{low:g}, {high:g}]")
+        console.print(table)
+
+
+@config_app.command("schema")
+def config_schema() -> None:
+    """Explain every key: type, default, meaning, unit and source."""
+    from space_dist.config import schema
+
+    for key, kind, default, text in schema():
+        if kind == "section":
+            console.print(f"\n[bold]{key}[/bold]  {text}", highlight=False)
+        else:
+            about_it = kind if default == "required" else f"{kind}, default {default}"
+            required = " (required)" if default == "required" else ""
+            console.print(f"  [bold]{key}[/bold]: {escape(about_it)}{required}", highlight=False)
+            console.print(Padding(escape(text), (0, 0, 0, 6)), highlight=False)
+
+
+@config_app.command("check")
+def config_check(
+    config: Annotated[Path, typer.Argument(help="A run's YAML file.")],
+    overrides: Overrides = None,
+) -> None:
+    """Check a config and its instance files, and print it with every default written out."""
+    from space_dist import config as configs
+    from space_dist.launch import about, read_instances
+    from space_dist.training import make_setup
+
+    run = configs.load(config, list(overrides or []))
+    with about(str(config)):
+        make_setup(run, *read_instances(run))
+    print(configs.dump(run), end="")
