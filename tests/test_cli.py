@@ -15,6 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from space_dist import cli
+from space_dist.cli import runs
+from space_dist.interrupts import StopRequests
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,7 +49,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 def _own_arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["space-dist"])
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(cli, "STOP", cli.StopRequests())
+    monkeypatch.setattr(runs, "STOP", StopRequests())
     monkeypatch.chdir(tmp_path)
 
 
