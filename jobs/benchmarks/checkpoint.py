@@ -22,13 +22,13 @@ console = Console()
 
 LIMIT = 0.02  # of a run's wall time
 NEVER = ["checkpoint.every_rounds=1000000000", "checkpoint.every_seconds=1000000000"]
-# Steps enough that the replay buffer of 100,000 transitions is full for half of DQN's run.
+# Steps enough to fill the replay buffer of 100,000 transitions and to go on with it full.
 RUNS = {
     "PPO": ("pointmass_space", ["budget.steps=81920"]),
     "DQN, 100,000 transitions": (
         "cartpole_dqn_space",
-        ["budget.steps=200000", "learner.buffer_size=100000", "rollout.shards=1", "rollout.slots=1",
-         "learner.gradient_steps_per_step=0.1"],
+        ["budget.steps=130000", "budget.episodes=null", "learner.buffer_size=100000",
+         "learner.gradient_steps_per_step=0.25"],  # SB3's default
     ),
 }  # fmt: skip
 
