@@ -380,7 +380,9 @@ class RayCluster:
         self._failed_starts[seat] += 1
         if isinstance(cause, SpaceDistError):
             raise cause
-        if self._failed_starts[seat] == _ATTEMPTS or (cause is not None and not isinstance(cause, RayError)):
+        if isinstance(cause, RayTaskError) and not _is_loss(cause):  # its environment's or policy's own fault
+            raise _cause(cause) from error
+        if self._failed_starts[seat] == _ATTEMPTS:
             what = "no sign of life" if error is None else _first_line(error)
             raise SpaceDistError(f"{_name(seat)} died as it started: {what}") from error
         if error is not None:
