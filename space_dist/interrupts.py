@@ -57,6 +57,11 @@ class StopRequests:
         """Also stop once `stop_file` exists."""
         self._file, self._grace_seconds = stop_file, grace_seconds
 
+    @property
+    def signalled(self) -> str | None:
+        """The signal that asked to stop, if one did."""
+        return self._reason
+
     def reason(self) -> str | None:
         """Why to stop, or None."""
         if self._reason is None and self._file is not None and self._file.exists():

@@ -118,7 +118,7 @@ def launch(
 
 def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
     """Stop before the first round. Raises Interrupted; what was committed by then is all there is."""
-    reason = stop.reason()
+    reason = stop.signalled  # the file was removed as the run began
     if reason is not None and writer.status is not None:
         message = f"stopped by {reason} before its first round; --resume continues"
         writer.set_status(replace(writer.status, state="interrupted", message=reason, updated_at=time.time()))

@@ -32,9 +32,9 @@ def original(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     config = short(folder, "dqn", 4)
     launch(config, folder / "reference", resume=True, stop=StopRequests())
     if request.param == "interrupted":
-        half = iter((None, None, None, "the test"))
+        half = iter((None, "the test"))
         stop = StopRequests()
-        stop.reason = lambda: next(half)  # type: ignore[method-assign] # asked twice before the first round
+        stop.reason = lambda: next(half)  # type: ignore[method-assign]
         with pytest.raises(SpaceDistError, match="stopped by the test"):
             launch(config, folder / "run", resume=True, stop=stop)
     else:
