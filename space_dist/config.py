@@ -10,7 +10,8 @@ import reprlib
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
@@ -20,22 +21,26 @@ from ruamel.yaml.events import AliasEvent
 
 from space_dist.errors import ConfigError, nearest
 
+M = TypeVar("M", bound=BaseModel)
+
 _MAX_CONFIG_BYTES = 64 << 10
 _MAX_ALIASES = 20  # each may double what a file means
 _MAX_WORD = 100  # characters of a key
 _MAX_LIST = 10_000
 _MAX_BRACKETS = 200  # open at once
 _MAX_NESTING = 50
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A part of a config: nothing unknown, nothing converted, nothing changed later."""
+
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
 
-class EnvConfig(_Section):
+class EnvConfig(Section):
     """The environment."""
 
     id: str = Field(min_length=1, max_length=300)
@@ -48,7 +53,7 @@ class EnvConfig(_Section):
     value-based curricula need it where all episodes start alike."""
 
 
-class InstancesConfig(_Section):
+class InstancesConfig(Section):
     """The instance sets."""
 
     train: Path = Field(strict=False)
@@ -58,7 +63,7 @@ class InstancesConfig(_Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-class GrowingConfig(_Section):
+class GrowingConfig(Section):
     """What all curricula share whose set grows by SPaCE's rule."""
 
     eta: float = Field(default=0.1, gt=0.0)
@@ -134,14 +139,14 @@ class ContextSpaceConfig(GrowingConfig):
     its nearest instance, which never drops one. Source: the released code (with L1); ours."""
 
 
-class RoundRobinConfig(_Section):
+class RoundRobinConfig(Section):
     """All instances in turn, in a random order fixed by the seed (the paper's first baseline, section 5.2)."""
 
     kind: Literal["round_robin"]
     """Which curriculum: round robin."""
 
 
-class FixedConfig(_Section):
+class FixedConfig(Section):
     """Control: round robin over a part of the training instances. Give either `ids` or `count`."""
 
     kind: Literal["fixed"]
@@ -165,7 +170,7 @@ CurriculumConfig = Annotated[
 ]
 
 
-class _Learner(_Section):
+class _Learner(Section):
     policy: str = Field(default="MlpPolicy", min_length=1, max_length=300)
     """SB3's MlpPolicy (acts in NumPy, without torch), CnnPolicy (images), MultiInputPolicy (dictionaries), or the
     import path of a policy class (my_package.my_module:MyPolicy)."""
@@ -370,7 +375,7 @@ LearnerConfig = Annotated[
 ]
 
 
-class RolloutConfig(_Section):
+class RolloutConfig(Section):
     """How transitions are collected. All of it decides results; how many workers share the shards does not."""
 
     shards: int = Field(default=4, ge=1, le=4096)
@@ -385,7 +390,7 @@ class RolloutConfig(_Section):
     one state (PointMass)."""
 
 
-class BudgetConfig(_Section):
+class BudgetConfig(Section):
     """How long a run is."""
 
     steps: int = Field(ge=1, le=10**12)
@@ -394,7 +399,7 @@ class BudgetConfig(_Section):
     """Training episodes after which the run ends if its steps have not; null: no such limit."""
 
 
-class EvaluationConfig(_Section):
+class EvaluationConfig(Section):
     """Deterministic evaluation on every training and test instance, on environments and seeds of its own."""
 
     every_steps: int | Literal["log"] = Field(default=10_000)
@@ -412,7 +417,7 @@ class EvaluationConfig(_Section):
         return value
 
 
-class CheckpointConfig(_Section):
+class CheckpointConfig(Section):
     """When the run makes its progress permanent; it does so too when asked to stop. Decides no result."""
 
     every_rounds: int = Field(default=20, ge=1)
@@ -421,7 +426,15 @@ class CheckpointConfig(_Section):
     """Seconds between checkpoints, at most (and at least one update)."""
 
 
-class TrackingConfig(_Section):
+def checked_uri(value: str | None) -> str | None:
+    """A tracking URI of a kind we know. Raises ValueError for any other."""
+    kinds = ("sqlite:///", "http://", "https://")
+    if value is not None and not any(value.startswith(kind) and value != kind for kind in kinds):
+        raise ValueError("a tracking URI is sqlite:///FILE or http(s)://HOST:PORT")
+    return value
+
+
+class TrackingConfig(Section):
     """Where MLflow keeps its mirror of the run. Decides no result."""
 
     uri: str | None = Field(default="sqlite:///mlflow.db", max_length=2000)
@@ -432,16 +445,13 @@ class TrackingConfig(_Section):
     @field_validator("uri")
     @classmethod
     def _known_kind(cls, value: str | None) -> str | None:
-        kinds = ("sqlite:///", "http://", "https://")
-        if value is not None and not any(value.startswith(kind) and value != kind for kind in kinds):
-            raise ValueError("a tracking URI is sqlite:///FILE or http(s)://HOST:PORT")
-        return value
+        return checked_uri(value)
 
     live: bool = True
     """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
 
 
-class ResourcesConfig(_Section):
+class ResourcesConfig(Section):
     """What the run may use. Decides no result."""
 
     workers: int = Field(default=1, ge=0, le=4096)
@@ -452,10 +462,10 @@ class ResourcesConfig(_Section):
     """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
 
 
-class RunConfig(_Section):
+class RunConfig(Section):
     """One run."""
 
-    name: str = Field(pattern=_NAME)
+    name: str = Field(pattern=NAME)
     """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
     """The one number from which every random number of the run comes."""
@@ -508,7 +518,7 @@ class RunConfig(_Section):
         return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots
 
 
-NOT_IDENTITY = ("checkpoint", "tracking", "resources")  # sections that cannot change a result
+NOT_IDENTITY = ("name", "checkpoint", "tracking", "resources")  # what cannot change a result
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
@@ -517,13 +527,7 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
     Relative instance paths become absolute, from the config's folder (from the current one in an override).
     Raises ConfigError with the file and key of every fault.
     """
-    data = _read_yaml(path)
-    instances = data.get("instances")
-    if isinstance(instances, dict):
-        folder = path.absolute().parent
-        data["instances"] = {
-            key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()
-        }
+    data = read(path)
     for override in overrides:
         _apply(data, override)
     if seed is not None:
@@ -532,12 +536,31 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
     return parse(data, str(path), origins)
 
 
+def read(path: Path) -> dict[str, Any]:
+    """A run's config as plain data, not checked yet; relative instance paths become absolute, from its folder."""
+    data = read_yaml(path)
+    instances = data.get("instances")
+    if isinstance(instances, dict):
+        data["instances"] = from_folder(instances, path.absolute().parent)
+    return data
+
+
+def from_folder(instances: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The `instances` section with its relative paths taken from `folder`."""
+    return {key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()}
+
+
 def parse(data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> RunConfig:
-    """Check plain data against the schema. `origins` says which keys came from elsewhere than `source`."""
+    """Check plain data against the schema of a run. `origins` says which keys came from elsewhere than `source`."""
+    return check(RunConfig, data, source, origins)
+
+
+def check(model: type[M], data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> M:
+    """Check plain data against any schema made of sections. Raises ConfigError with the key of every fault."""
     try:
-        return RunConfig.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
-        faults = [_explain(fault, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
+        faults = [_explain(fault, model, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
         raise ConfigError("\n".join(dict.fromkeys(faults))) from None
 
 
@@ -546,10 +569,22 @@ def dump(config: RunConfig) -> str:
     return to_yaml(config.model_dump(mode="json"))
 
 
-def identity(config: RunConfig, train_digest: str, test_digest: str) -> str:
-    """`(64 hex digits)` a hash of everything that decides the run's results, instance files by their content."""
-    data = config.model_dump(mode="json", exclude=set(NOT_IDENTITY))
+def identity(
+    config: RunConfig, train_digest: str, test_digest: str, *, sources: Mapping[str, str] = MappingProxyType({}),
+    with_seed: bool = True,
+) -> str:  # fmt: skip
+    """`(64 hex digits)` a hash of everything that decides the run's results; without its seed, that of a grid's cell.
+
+    Instance files count by their content, and so does a user's own code: `sources`, by import path. Fields at their
+    default are left out, so that a field that is added later changes no identity.
+    """
+    exclude = {*NOT_IDENTITY, "seed"}
+    data = config.model_dump(mode="json", exclude=exclude, exclude_defaults=True)
     data["instances"] = {"train": train_digest, "test": test_digest}
+    if sources:
+        data["sources"] = dict(sources)
+    if with_seed:
+        data["seed"] = config.seed
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -585,7 +620,8 @@ def to_yaml(data: Mapping[str, Any]) -> str:
     return buffer.getvalue()
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The keys and values of a YAML file that is small, plain and UTF-8. Raises ConfigError otherwise."""
     try:
         if path.is_dir():
             raise ConfigError(f"{path} is a folder; a config is a YAML file")
@@ -640,19 +676,19 @@ def _parse_yaml(content: bytes | str, source: str) -> Any:
     except DuplicateKeyError as error:
         where = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = str(error.problem).split(" with value")[0]
-        raise ConfigError(f"{source}{where}: {_clean(problem)}: every key may stand once") from None
+        raise ConfigError(f"{source}{where}: {clean(problem)}: every key may stand once") from None
     except YAMLError as error:
         mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
         where = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else str(error)
-        raise ConfigError(f"{source}{where} is not valid YAML: {_clean(str(problem))}") from None
+        raise ConfigError(f"{source}{where} is not valid YAML: {clean(str(problem))}") from None
     except _ValueFaultError as error:
         raise ConfigError(f"{source}: {error}") from None
     except RecursionError:
         raise ConfigError(f"{source} is nested too deeply") from None
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, NotImplementedError,
             AssertionError) as error:  # fmt: skip  # ruamel asserts that %YAML names a version it knows
-        raise ConfigError(f"{source} is not valid YAML: {_clean(str(error))}") from None
+        raise ConfigError(f"{source} is not valid YAML: {clean(str(error))}") from None
 
 
 def _refuse_tricks(text: str, source: str) -> None:
@@ -669,7 +705,7 @@ def _refuse_tricks(text: str, source: str) -> None:
         if tag is not None and str(tag) != "!":
             line = event.start_mark.line + 1
             raise ConfigError(
-                f"{source}, line {line} is not valid YAML for a config: tags like {_clean(str(tag))!r} are not read"
+                f"{source}, line {line} is not valid YAML for a config: tags like {clean(str(tag))!r} are not read"
             )
     if aliases > _MAX_ALIASES:
         raise ConfigError(f"{source} has {aliases} aliases; at most {_MAX_ALIASES} are read")
@@ -703,6 +739,17 @@ def _plain(value: Any, path: tuple[str, ...] = ()) -> Any:
     raise fault(f"{_short(value)} is a {type(value).__name__}; write numbers, words, lists and keys only")
 
 
+def put(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+    """Set `a.b` in nested data, making sections on the way. Raises ConfigError if `a` is no section."""
+    section: Any = data
+    *parents, last = key.split(".")
+    for part in parents:
+        section = section.setdefault(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"{where}: {part!r} is not a section")
+    section[last] = value
+
+
 def _apply(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
@@ -711,12 +758,7 @@ def _apply(data: dict[str, Any], override: str) -> None:
     value = _parse_yaml(text, f"--set {override}")
     if parts[0] == "instances":
         value = _from_here(value)
-    section: Any = data
-    for part in parts[:-1]:
-        section = section.setdefault(part, {})
-        if not isinstance(section, dict):
-            raise ConfigError(f"--set {override}: {part!r} is not a section")
-    section[parts[-1]] = value
+    put(data, ".".join(parts), value, f"--set {override}")
 
 
 def _from_here(value: Any) -> Any:
@@ -726,8 +768,8 @@ def _from_here(value: Any) -> Any:
     return str(Path(value).absolute()) if isinstance(value, str) and value else value
 
 
-def _explain(fault: Any, source: str, origins: Mapping[str, str]) -> str:
-    path, model = _locate(fault["loc"])
+def _explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str, str]) -> str:
+    path, model = _locate(fault["loc"], root)
     if fault["type"].startswith("union_tag"):
         path.append("kind")
     key = ".".join(path)
@@ -761,10 +803,10 @@ def _tags(key: str) -> str:
     )
 
 
-def _locate(location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel] | None]:
+def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[list[str], type[BaseModel] | None]:
     """Pydantic's location without the tags of unions, and the section it lies in."""
     path: list[str] = []
-    model: type[BaseModel] | None = RunConfig
+    model: type[BaseModel] | None = root
     options: list[type[BaseModel]] = []
     for part in location:
         tagged = [option for option in options if get_args(option.model_fields["kind"].annotation)[0] == part]
@@ -814,7 +856,7 @@ def _type_name(field: Any) -> str:
     return " ".join([name, *limits])
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """At most 200 characters of somebody else's text, none of which commands a terminal."""
     line = (text.splitlines() or [""])[0][:200]
     return "".join(character if character.isprintable() else repr(character)[1:-1] for character in line)

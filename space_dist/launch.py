@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import logging
 import os
-import platform
 import secrets
 import subprocess
 import sys
@@ -29,12 +27,12 @@ from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
 from space_dist.policy import Policy, from_arrays
+from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
 from space_dist.training import Progress, Training, make_env, make_setup, policy_in
 
 log = logging.getLogger("space_dist")
 
-_BITS_DEPEND_ON = ("numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "space-dist")
 _FINAL_PUSH_SECONDS = 120.0
 
 
@@ -102,7 +100,7 @@ def launch(
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
-                    "resumed on another CPU model or with other library versions: results are valid, but no longer "
+                    "resumed on another CPU model, or with other code or library versions: results are valid, but not "
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
@@ -111,18 +109,6 @@ def launch(
                     config, setup, cluster, writer, status=status, stop_requested=stop.reason, observe=observe
                 ).run()
     return Outcome(ledger, tracking_warning=_final_push(config, ledger, pusher))
-
-
-def fingerprint() -> dict[str, str]:
-    """What bit-equality is promised for: the CPU's model and the versions of what computes."""
-    model = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    versions = {name: importlib.metadata.version(name) for name in _BITS_DEPEND_ON}
-    return {"cpu": model, "python": platform.python_version(), **versions}
 
 
 def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
