@@ -43,7 +43,7 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-_LOOKING_SHARE: Final = 20  # at most one part in so many of a follower's time goes into looking at files
+_LOOK_SECONDS: Final = 0.25  # a follower that looks at its files for longer than this does so less often
 _STATUS: Final = "status.json"
 _CELL: Final = re.compile(rf"[0-9a-f]{{{CELL_ID_DIGITS}}}")
 
@@ -172,7 +172,7 @@ def follow(
                 last = False
         if last:
             return total
-        until = time.monotonic() + max(poll_seconds, _LOOKING_SHARE * (looking + mirror.looking_seconds))
+        until = time.monotonic() + poll_seconds * max(1.0, (looking + mirror.looking_seconds) / _LOOK_SECONDS)
         while (left := until - time.monotonic()) > 0:
             if not mirror.anyone_works(found) if stop is None else stop():
                 break

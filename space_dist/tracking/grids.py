@@ -340,6 +340,8 @@ def final_return(ledger: Ledger, status: Status) -> float | None:
 
 def _backwards(path: Path, size: int) -> Iterator[Row]:
     """The intact rows of a file's first `size` bytes, the last one first."""
+    if not size:
+        return
     rest, position = b"", size
     with path.open("rb") as file:
         while position:

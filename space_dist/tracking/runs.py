@@ -37,6 +37,7 @@ ARTIFACTS_TAG: Final = "space_dist.artifacts"
 GRID_TAG: Final = "space_dist.grid_key"
 STARTED_TAG: Final = "space_dist.started"
 STAMP_TAG: Final = "space_dist.stamp"
+TABLE_TAG: Final = "space_dist.results"
 NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
 
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
@@ -342,10 +343,12 @@ class Store:
         with store_errors(self._uri):
             run = self._client.get_run(run_id)
             changed = [RunTag(key, value) for key, value in parent.tags.items() if run.data.tags.get(key) != value]
-            if parent.table is not None and changed:
+            for start in range(0, len(changed), _MAX_TAGS):
+                self._client.log_batch(run_id, tags=changed[start : start + _MAX_TAGS])
+            table = key_of(parent.table or "")
+            if parent.table is not None and run.data.tags.get(TABLE_TAG) != table:
                 self._client.log_text(run_id, parent.table, "results.md")
-            if changed:
-                self._client.log_batch(run_id, tags=changed)
+                self._client.set_tag(run_id, TABLE_TAG, table)
             self._push_ending(run, parent.ending, parent.ended_at)
 
     def _experiment_id(self, name: str) -> str:
