@@ -28,7 +28,7 @@ from space_dist.errors import LedgerError
 from space_dist.ledger import METRICS, TIMING, Ledger, Lock, RunWriter
 from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
 from space_dist.standing import Attempts, Cause, Ended
-from space_dist.tracking import NOTE_TAG, RUN_TAG, TrackingError, find, follow, sync
+from space_dist.tracking import NOTE_TAG, TrackingError, find, follow, sync
 from space_dist.tracking.grids import final_return
 from tests.test_report import GROWTH, STARTED, continue_run, start_run
 from tests.test_tracking import contents, histories
@@ -431,7 +431,7 @@ def server(database: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
         "--artifacts-destination", str(database.parent / "artifacts"), "--host", "127.0.0.1", "--port", str(port),
         "--workers", "1", "--allowed-hosts", f"127.0.0.1:{port},localhost:{port}",
     ]  # fmt: skip
-    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true"}
+    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     with (database.parent / "server.log").open("ab") as output:
         process = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True, env=environment)
     try:
@@ -476,8 +476,8 @@ def test_a_server_that_was_killed_in_the_middle_has_everything_once_after_a_sync
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    grid, manifest = make_grid(tmp_path / "demo", f"http://127.0.0.1:{port}", seeds=(0, 1, 2))
-    ledgers = [run_to(grid, cell, seed, last=cell + seed) for cell in (0, 1) for seed in (0, 1, 2)]
+    grid, manifest = make_grid(tmp_path / "demo", f"http://127.0.0.1:{port}")
+    ledgers = [run_to(grid, cell, seed, last=cell + seed) for cell in (0, 1) for seed in (0, 1)]
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
     write, batches = MlflowClient.log_batch, 0
 
@@ -486,7 +486,7 @@ def test_a_server_that_was_killed_in_the_middle_has_everything_once_after_a_sync
         def fatal(*args: Any, **keywords: Any) -> Any:
             nonlocal batches
             batches += "metrics" in keywords
-            if batches == 4:
+            if batches == 2:
                 os.killpg(process.pid, signal.SIGKILL)
             return write(*args, **keywords)
 
@@ -495,12 +495,12 @@ def test_a_server_that_was_killed_in_the_middle_has_everything_once_after_a_sync
             sync([], grids=[grid])
     with server(database, port):
         result = sync([], grids=[grid])
-        assert (result.runs, result.failed) == (6, {})
-        assert 0 < result.created < 6
+        assert (result.runs, result.failed) == (4, {})
+        assert 0 < result.created < 4
         parent, children = everything(manifest.tracking.uri or "")
         assert sync([], grids=[grid]).rows == 0
-    assert parent.info.status == "FINISHED"
-    assert "| eta=0.2 | `000000000001` | 2 | 2 | 1 | 3 | 3/3 |" in parent.data.tags[NOTE_TAG]
+    assert (parent.info.status, len(children)) == ("FINISHED", 4)
+    assert "| eta=0.2 | `000000000001` | 1.5 | 1.5 | 1 | 2 | 2/2 |" in parent.data.tags[NOTE_TAG]
     assert {child.info.status for child in children.values()} == {"FINISHED"}
     with contextlib.closing(sqlite3.connect(database)) as connection:
         for ledger in ledgers:
@@ -510,5 +510,3 @@ def test_a_server_that_was_killed_in_the_middle_has_everything_once_after_a_sync
                 " where t.key = 'space_dist.folder' and t.value = ?", (folder,),
             ).fetchall()  # fmt: skip
             assert sorted(stored) == points_of(ledger)
-        (runs,) = connection.execute("select count(*) from tags where key = ?", (RUN_TAG,)).fetchone()
-    assert runs == 7

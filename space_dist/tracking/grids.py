@@ -427,7 +427,7 @@ def _standing(looks: Sequence[Look]) -> list[str]:
     lines = [f"**{len(looks)} runs**: {', '.join(words)}"]
     if any(look.standing.other_code for look in looks):
         count = sum(look.standing.other_code for look in looks)
-        lines += ["", f"{_count(count, 'run')} done by another version of this package than the one that says so."]
+        lines += ["", f"{count} of the done were computed by another version of this package than this table."]
     if failed:
         lines.append("")
         for one in failed[:_SHOWN_FAILURES]:

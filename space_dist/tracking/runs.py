@@ -42,6 +42,8 @@ NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
 
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
 _MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
+# Without it, MLflow's pages take the runs for evaluations of language models.
+_EXPERIMENT_TAGS: Final = {"mlflow.experimentKind": "custom_model_development"}
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
 _ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
@@ -359,7 +361,9 @@ class Store:
         found = self._client.get_experiment_by_name(name)
         if found is None:
             try:
-                identity = self._client.create_experiment(name, artifact_location=self._artifact_location)
+                identity = self._client.create_experiment(
+                    name, artifact_location=self._artifact_location, tags=_EXPERIMENT_TAGS
+                )
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
