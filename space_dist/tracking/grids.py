@@ -185,7 +185,9 @@ class GridMirror:
     def _push(self, manifest: Manifest, store: Store, experiment: str) -> tuple[int, int]:
         key = key_of("grid", str(self.grid.folder.resolve()), manifest.name)
         created = rows = 0
-        parent_id = store.find_parent(self._parent(manifest, key), experiment)
+        parent_id = store.find_parent(key, experiment)
+        if parent_id is None:
+            parent_id = store.create_parent(self._parent(manifest, key), experiment)
         listed = parent_id != self._parent_id
         if listed:
             self._take_nothing_for_granted()

@@ -42,8 +42,6 @@ NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
 
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
 _MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
-# Without it, MLflow's pages take the runs for evaluations of language models.
-_EXPERIMENT_TAGS: Final = {"mlflow.experimentKind": "custom_model_development"}
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
 _ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
@@ -326,16 +324,20 @@ class Store:
                 if not page:
                     return found
 
-    def find_parent(self, parent: Parent, experiment: str) -> str:
-        """The id of a grid's own run, which is created if it is not there."""
+    def find_parent(self, key: str, experiment: str) -> str | None:
+        """The id of a grid's own run, if it is there."""
         with store_errors(self._uri):
-            experiment_id = self._experiment_id(experiment)
-            found = self._client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{parent.key}'")
-            if found:
-                return min(str(run.info.run_id) for run in found)
+            found = self._client.search_runs([self._experiment_id(experiment)], f"tags.`{RUN_TAG}` = '{key}'")
+            return min((str(run.info.run_id) for run in found), default=None)
+
+    def create_parent(self, parent: Parent, experiment: str) -> str:
+        """The id of a grid's own run, which is not there yet."""
+        with store_errors(self._uri):
             tags = {RUN_TAG: parent.key, **parent.tags}
             start = round(parent.started_at * 1000)
-            run = self._client.create_run(experiment_id, start_time=start, tags=tags, run_name=parent.name)
+            run = self._client.create_run(
+                self._experiment_id(experiment), start_time=start, tags=tags, run_name=parent.name
+            )
             return str(run.info.run_id)
 
     def push_parent(self, parent: Parent, run_id: str) -> None:
@@ -361,9 +363,7 @@ class Store:
         found = self._client.get_experiment_by_name(name)
         if found is None:
             try:
-                identity = self._client.create_experiment(
-                    name, artifact_location=self._artifact_location, tags=_EXPERIMENT_TAGS
-                )
+                identity = self._client.create_experiment(name, artifact_location=self._artifact_location)
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
