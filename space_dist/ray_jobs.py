@@ -58,11 +58,11 @@ def conduct(
     max_parallel: runs at a time; None: as many as fit. `reinstall` is called after Ray has taken the signal handlers.
     Raises SpaceDistError if there is no room for one run, Interrupted if asked to stop.
     """
-    with _joined(address, manifest, max_parallel):
+    with _joined(address, manifest, max_parallel) as dashboard:
         reinstall()
         size = _room_for(manifest, max_parallel)
         in_jobs = address != "local" and _as_jobs(grid, manifest, runs, mode)
-        place = Jobs(grid, manifest, size) if in_jobs else Pool(grid, manifest, min(size, max(1, len(runs))))
+        place = Jobs(grid, manifest, size, dashboard) if in_jobs else Pool(grid, manifest, min(size, max(1, len(runs))))
         with place as executor:
             return Conductor(
                 grid, manifest, runs, executor, stop_requested=stop_requested, observe=observe
@@ -70,23 +70,26 @@ def conduct(
 
 
 @contextlib.contextmanager
-def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Iterator[None]:
+def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Iterator[str]:
+    """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
     try:
         if address == "local":
             cores = len(os.sched_getaffinity(0))
             # A run with rollout actors may have more processes than this machine has cores; they share them.
             cpus = max(cores, (max_parallel or 1) * manifest.cpus_per_run)
-            ray.init(
+            context = ray.init(
                 address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False,
                 logging_level=logging.ERROR, configure_logging=False, object_store_memory=_OBJECT_STORE_BYTES,
             )  # fmt: skip
         else:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False)
+            context = ray.init(
+                address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
+            )  # fmt: skip
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SpaceDistError(f"Ray cannot be started or reached at {address!r}: {first}") from error
     try:
-        yield
+        yield context.address_info.get("webui_url") or ""  # type: ignore[attr-defined]
     finally:
         ray.shutdown()
 
@@ -121,11 +124,12 @@ def _as_jobs(grid: Grid, manifest: Manifest, runs: Sequence[Run], mode: Mode) ->
 class Jobs:
     """An `Executor` that gives each run a Ray job; admission is its own, so that no job waits inside Ray."""
 
-    def __init__(self, grid: Grid, manifest: Manifest, max_in_flight: int) -> None:
+    def __init__(self, grid: Grid, manifest: Manifest, max_in_flight: int, dashboard: str) -> None:
         self._grid, self._manifest, self._max = grid, manifest, max_in_flight
         self._nonce = Nonce(grid)
         context = ray.get_runtime_context()
-        dashboard = ray.worker.global_worker.node.webui_url
+        if not dashboard:
+            raise SpaceDistError("this Ray cluster runs no dashboard, and so takes no jobs; use --mode pool")
         self._client = _client(f"http://{dashboard}")
         # The conductor's own code is the runs': its uploaded folder, if it came with one.
         self._runtime_env = {key: value for key, value in dict(context.runtime_env).items()

@@ -149,7 +149,7 @@ class Attempts:
                         ends[last.cause] += 1
                 elif row["event"] == "retry":
                     ends.clear()
-                    last = None
+                    last = Ended(None)
         return History(begun, last, ends, where)
 
 

@@ -356,13 +356,11 @@ def main() -> None:
 
 
 def preload() -> None:
-    """Import what every run needs, so that forks need not."""
-    import sb3_contrib
-    import stable_baselines3
-
+    """Import what every run needs, so that forks need not. Starts no thread."""
     import space_dist.launch  # noqa: F401
+    from space_dist import learner
 
-    _ = (sb3_contrib, stable_baselines3)
+    learner.preload()
 
 
 if __name__ == "__main__":
