@@ -137,12 +137,9 @@ class GridMirror:
 
     def any_alive(self) -> bool:
         """Whether a run that was alive at the last look still is."""
-        if self._manifest is None:
-            return False
-        running = [look.standing.run for look in self._looks.values() if look.running]
-        return any(
-            standing_of(run, self.grid.ledger(run), self._manifest.retry, code_digest()).condition == "running"
-            for run in running
+        manifest, running = self._manifest, [look for look in self._looks.values() if look.running]
+        return manifest is not None and any(
+            _look(look.standing.run, look.standing.ledger, manifest, look.files).running for look in running
         )
 
     def look(self) -> Manifest:
