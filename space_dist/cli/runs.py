@@ -136,26 +136,34 @@ def print_report(result: Report, to: Console) -> None:
 
 
 def sync(
-    runs: Runs,
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN|GRID...", help="Runs' or grids' folders, folders that hold some, or grids' YAML files."
+        ),
+    ],
     uri: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Tracking URI; default: each run's own (tracking.uri)."),
+        typer.Option(help="Tracking URI; default: each run's or grid's own (tracking.uri)."),
     ] = None,
     experiment: Annotated[Optional[str], typer.Option(help="MLflow experiment.")] = None,  # noqa: UP045
-    follow: Annotated[bool, typer.Option("--follow", help="Go on until the runs have ended.")] = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Go on until nobody works on the grids, and the runs have ended.")
+    ] = False,
+    root: Annotated[Path, typer.Option(help="Where the grids of YAML files are.")] = Path("runs"),
 ) -> None:
-    """Replay runs into MLflow. Doing it twice changes nothing."""
-    from space_dist.ledger import find_ledgers
+    """Replay runs and grids into MLflow. Doing it twice changes nothing."""
+    from space_dist.manifest import find_grid
+    from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs
 
-    ledgers = find_ledgers(runs)
+    paths = [find_grid(path, root).folder if path.is_file() else path for path in runs]
+    found = find(paths)
     if follow:
-        result = follow_runs(
-            runs, uri, experiment, stop=lambda: not any(ledger.owner_alive() for ledger in ledgers)
-        )  # fmt: skip
+        result = follow_runs(paths, uri, experiment)
     else:
-        result = sync_runs(ledgers, uri, experiment)
+        result = sync_runs(found.ledgers, uri, experiment, grids=found.grids)
     console.print(
         f"{result.runs} runs are up to date in MLflow ({result.created} new, {result.rows} rows pushed"
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),
