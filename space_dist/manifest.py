@@ -117,7 +117,7 @@ class GridConfig(Section):
     """Axes of equal length that go together: first values with first values, and so on."""
     exclude: tuple[dict[str, Any], ...] = Field(default=(), strict=False)
     """Cells to leave out: all those that have every key and value of an entry."""
-    seeds: tuple[Annotated[int, Field(ge=0, le=2**31 - 1)], ...] | SeedRange = Field(strict=False)
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0, le=2**31 - 1)], ...], Field(strict=False)] | SeedRange
     """Every cell runs with each: a list, or start and count."""
     resources: RunResources = RunResources()
     retry: Retry = Retry()
