@@ -28,6 +28,11 @@ class Picture:
         """The whole picture as the address of an <img>."""
         return f"data:image/png;base64,{base64.b64encode(self.png).decode()}"
 
+    @property
+    def pixels(self) -> int:
+        """Its width, from the PNG's header."""
+        return int.from_bytes(self.png[16:20])
+
 
 @dataclass(frozen=True)
 class Section:
@@ -92,4 +97,10 @@ def _page() -> Template:
         loader=PackageLoader("space_dist.report", "."), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
+    environment.filters["unbroken"] = _unbroken
     return environment.get_template("page.html")
+
+
+def _unbroken(text: str) -> str:
+    """A cell whose lines do not break within brackets."""
+    return re.sub(r"\[[^\]]*\]|\([^)]*\)", lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), text)

@@ -108,9 +108,10 @@ def bootstrap_interval(
         raise ValueError("no values")
     columns = values.reshape(n, -1)
     bounds = np.full((2, columns.shape[1]), np.nan)
+    places = np.flatnonzero(~np.isnan(columns).any(axis=0)) if n > 1 else np.zeros(0, dtype=np.int64)
     width = max(1, _MAX_ELEMENTS // (n * resamples))
-    for first in range(0, columns.shape[1] if n > 1 else 0, width):
-        part = slice(first, first + width)
+    for first in range(0, len(places), width):
+        part = places[first : first + width]
         bounds[:, part] = _bootstrap((columns[:, part],), statistic, n, resamples=resamples, axis=0)
     low, high = bounds.reshape(2, *values.shape[1:])
     return low, high
@@ -148,7 +149,7 @@ def stratified(strata: Sequence[FloatArray], statistic: Statistic = interquartil
     there are. No interval where a stratum has a single value. Raises ValueError without values.
     """
     centre = float(statistic(np.concatenate(strata)))
-    if any(len(stratum) < 2 for stratum in strata):
+    if np.isnan(centre) or any(len(stratum) < 2 for stratum in strata):
         return Interval(centre)
 
     def pooled(*resampled: FloatArray, axis: int) -> FloatArray:
@@ -197,17 +198,17 @@ def restricted(times: FloatArray, budget: float) -> FloatArray:
 def paired_ratio(ours: FloatArray, theirs: FloatArray) -> Interval:
     """The mean of `ours` over the mean of `theirs`, both `(n,)` and of the same seeds, which are resampled in pairs.
 
-    NaN without seeds and where the mean of `theirs` is 0; no interval where that of a resample is.
+    Neither holds a negative number. NaN without seeds and where the mean of `theirs` is 0; no interval where a resample
+    of `theirs` may be all 0.
     """
     if not len(ours) or not theirs.any():
         return Interval(np.nan)
 
     def ratio(above: FloatArray, below: FloatArray, axis: int) -> FloatArray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(above.mean(axis=axis) / below.mean(axis=axis))
+        return np.asarray(above.mean(axis=axis) / below.mean(axis=axis))
 
     centre = float(ratio(ours, theirs, 0))
-    if len(ours) < 2:
+    if len(ours) < 2 or not theirs.all():
         return Interval(centre)
     return _interval(centre, *_bootstrap((ours, theirs), ratio, len(ours), paired=True))
 
