@@ -111,7 +111,8 @@ def evaluate(
 
 def report(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH...", help="A grid (folder or YAML file); or run folders, or their own.")
+        list[Path],
+        typer.Argument(metavar="PATH...", help="A grid (folder or YAML file); or run folders, or their own."),
     ],
     out: Annotated[
         Optional[Path],  # noqa: UP045

@@ -127,11 +127,12 @@ def draw_heat_map(found: HeatMap, low: float, high: float) -> Figure:
     n_rows, n_columns = found.means.shape
     figure = _figure(min(16.0, 2.8 + 1.25 * n_columns), min(16.0, 1.8 + 0.72 * n_rows))
     axes = figure.subplots()
-    colours = colormaps["cividis"].copy()
-    colours.set_bad("#EEEEEE")
+    colours = colormaps["cividis"].with_extremes(bad="#EEEEEE")
     image = axes.imshow(found.means, cmap=colours, vmin=low, vmax=max(high, low + 1e-9), aspect="auto")
-    axes.set_xticks(range(n_columns), [_plain(value) for value in found.columns])
-    axes.set_yticks(range(n_rows), [_plain(value) for value in found.rows])
+    across, down = ([_plain(textwrap.shorten(value, 24, placeholder="…")) for value in values]
+                    for values in (found.columns, found.rows))  # fmt: skip
+    axes.set_xticks(range(n_columns), across, rotation=90 if sum(map(len, across)) > 9 * n_columns else 0)
+    axes.set_yticks(range(n_rows), down)
     axes.set_xlabel(_plain(found.column_name))
     axes.set_ylabel(_plain(found.row_name))
     axes.set_title(_plain(found.title), fontsize=11)

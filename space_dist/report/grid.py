@@ -1,7 +1,7 @@
-"""A grid's runs compared: what each cell reached, how much surer and sooner than a baseline, and which runs are missing.
+"""A grid's runs compared: what each cell reached, how much surer and sooner than a baseline, and which are missing.
 
-A cell is compared with its *reference*: the baseline, or, in a grid of several environments or test sets, the baseline's
-counterpart there. Returns of different tasks are never pooled or compared.
+A cell is compared with its *reference*: the baseline, or, in a grid of several environments or test sets, the
+baseline's counterpart there. Returns of different tasks are never pooled or compared.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class Comparison:
 
     reference: None where the cell has none. improvement: probability that a seed of the cell ends above one of the
     reference; None for the reference itself. threshold: a test return; NaN where there is none. reach: when the cell's
-    seeds reached it; None if `untestable` says why that cannot be told. ratio: its restricted mean over the reference's,
-    both up to the smaller budget, over `pairs` seeds.
+    seeds reached it; None if `untestable` says why that cannot be told. ratio: its restricted mean over the
+    reference's, both up to the smaller budget, over `pairs` seeds.
     """
 
     reference: CellRuns | None
@@ -258,7 +258,7 @@ def grouped(
 
 @dataclass(frozen=True)
 class Pooled:
-    """All cells with one setting, pooled. `n_finished` of `n_runs` runs count; `seeds_per_cell`: least and most."""
+    """All cells with one setting, pooled; `n_finished` of `n_runs` runs count."""
 
     setting: str
     n_cells: int
@@ -275,7 +275,7 @@ def pool(cells: Sequence[CellRuns]) -> list[Pooled]:
     keys = varying(cells)
     if len({cell.task for cell in cells}) > 1:
         return []
-    found = []
+    found: list[Pooled] = []
     for key in keys:
         groups = grouped([cell for cell in cells if key in cell.settings], [key])
         if len(groups) < 2 or max(map(len, groups.values())) < 2:

@@ -48,24 +48,30 @@ from space_dist.report.tables import (
 MAX_DRAWN: Final = 48  # cells with a learning curve
 MAX_LISTED: Final = 100  # failures, remarks
 _CURVES_PER_PANEL: Final = 6
-_METHOD: Final = (
-    "Behind every number in round brackets stands how many of a cell's seeds it rests on: (9/10) are nine finished "
-    "seeds of ten. Runs that are not finished count in no number.",
-    "Final returns are undiscounted means over the held-out (test) instances at each finished run's last step. IQM: "
-    "interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are 95 % percentile "
-    f"bootstraps with {RESAMPLES:,} resamples (scipy.stats.bootstrap). What is resampled are the seeds of a cell; where "
-    "cells are pooled, those of each cell among themselves (stratified). With few seeds they are narrower than they "
-    "should be; a single seed has none. A cell with a final return that is no number has none either.",
-    "P(better) is the probability that a seed of the cell ends above a seed of the baseline, over all pairs of seeds, a "
-    "tie counting one half; the seeds of both are resampled, each for itself.",
-    "A threshold is reached at the first of three consecutive evaluations of the test return at or above it. Seeds that "
-    "do not reach it within their budget are censored: they count as the budget in the restricted mean, which is a "
-    "lower bound of the mean where seeds are censored. The ratio is the cell's restricted mean over the baseline's (0.5: "
-    "in half of the steps), both up to the smaller budget; its seeds are resampled in pairs, and the threshold is held "
-    "fixed. Untestable: the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound of one "
-    "more untrained seed.",
-    "Curves are IQMs over the finished seeds (while a cell has none, over unfinished ones, which its label says) with "
-    "the same intervals as bands. Steps are real environment steps of training.",
+_METHOD: Final = tuple(
+    " ".join(paragraph.split())
+    for paragraph in f"""
+Round brackets say how many of a cell's seeds a number rests on: (9/10) are nine finished seeds of ten. Runs that are
+not finished count in no number.
+
+Final returns are undiscounted means over the held-out (test) instances at each finished run's last step. IQM:
+interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are 95 % percentile
+bootstraps with {RESAMPLES:,} resamples (scipy.stats.bootstrap). What is resampled are the seeds of a cell; where cells
+are pooled, those of each cell among themselves (stratified). With few seeds they are narrower than they should be; a
+single seed has none. A cell with a final return that is no number has none either.
+
+P(better) is the probability that a seed of the cell ends above a seed of the baseline, over all pairs of seeds, a tie
+counting one half; the seeds of both are resampled, each for itself.
+
+A threshold is reached at the first of three consecutive evaluations of the test return at or above it. Seeds that do
+not reach it within their budget are censored: they count as the budget in the restricted mean, which is a lower bound
+of the mean where seeds are censored. The ratio is the cell's restricted mean over the baseline's (0.5: in half of the
+steps), both up to the smaller budget; its seeds are resampled in pairs, and the threshold is held fixed. Untestable:
+the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound (mean + t s sqrt(1 + 1/n)) of
+one more untrained seed.
+
+Curves are IQMs over the finished seeds (while a cell has none, over unfinished ones, which its label says) with the
+same intervals as bands. Steps are real environment steps of training.""".split("\n\n")
 )
 
 
@@ -136,7 +142,9 @@ def build_grid_report(
             atomic_write(folder / name, content)
     except OSError as error:
         raise ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}") from None
-    table = [_short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)]
+    table = [
+        _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
+    ]
     return GridReport(folder, summary, table, remarks, markdown)
 
 
@@ -155,8 +163,10 @@ def _summary(
     )
     rest = ", ".join(f"{count:,} {condition}" for condition, count in sorted(counts.items()))
     if not done:
-        return [f"No run of this grid has finished yet, so there is no number to report: of its {n_runs:,} runs ({size}), "
-                f"{rest}."]  # fmt: skip
+        return [
+            f"No run of this grid has finished yet, so there is no number to report: of its {n_runs:,} runs ({size}), "
+            f"{rest}."
+        ]
     every = "All" if done == n_runs else f"{done:,} of"
     sentences = [f"{every} {n_runs:,} runs are finished ({size}){f'; {rest}' if rest else ''}."]
     level = compared[cells.index(baseline)].threshold
@@ -313,9 +323,9 @@ def _curves(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Section]:
     drawn = [cell for cell in cells if cell.configuration.drawn]
     text = []
     if len(drawn) > MAX_DRAWN:
-        best = sorted(drawn, key=_descending)[:MAX_DRAWN]
-        text.append(f"Of {len(drawn):,} cells, the {MAX_DRAWN} of the highest final IQM are drawn, and the baseline.")
-        drawn = [cell for cell in drawn if cell in best]
+        text.append(f"Of {len(drawn):,} cells, the {MAX_DRAWN} of the highest final IQM are drawn, best first, and the "
+                    "baseline.")  # fmt: skip
+        drawn = sorted(drawn, key=_descending)[:MAX_DRAWN]
     if not drawn:
         return []
     if len(drawn) <= len(COLOURS):
@@ -336,9 +346,9 @@ def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
     """Cells that differ only by the grid's last setting in one panel, where that is few enough; else six and six."""
     keys = varying(cells)
     groups = grouped(cells, keys[:-1])
-    if max(map(len, groups.values())) > _CURVES_PER_PANEL or len(groups) * 2 > len(cells):
-        groups = {(f"{first + 1} to {min(first + _CURVES_PER_PANEL, len(cells))}",): list(cells[first : first + _CURVES_PER_PANEL])
-                  for first in range(0, len(cells), _CURVES_PER_PANEL)}  # fmt: skip
+    if max(map(len, groups.values())) > _CURVES_PER_PANEL or len(groups) * 3 > len(cells):
+        parts = [list(cells[at : at + _CURVES_PER_PANEL]) for at in range(0, len(cells), _CURVES_PER_PANEL)]
+        groups = {(f"cells {_CURVES_PER_PANEL * number + 1} and on",): part for number, part in enumerate(parts)}
 
     def curves(members: Sequence[CellRuns]) -> list[Configuration]:
         return [cell.configuration for cell in members if cell is not baseline]

@@ -206,6 +206,7 @@ def interval_text(found: Interval, decimals: int | None = None) -> str:
     if math.isnan(found.value):
         return NONE
     decimals = _decimals(found.value) if decimals is None else decimals
-    if found.low is None or found.high is None:
-        return f"{number_text(found.value, decimals)} [{NONE}]"
-    return f"{number_text(found.value, decimals)} [{number_text(found.low, decimals)}, {number_text(found.high, decimals)}]"
+    bounds = NONE
+    if found.low is not None and found.high is not None:
+        bounds = f"{number_text(found.low, decimals)}, {number_text(found.high, decimals)}"
+    return f"{number_text(found.value, decimals)} [{bounds}]"
