@@ -303,7 +303,7 @@ def test_the_heat_map_is_that_of_the_two_parameters(grid: Grid, written: Path) -
     np.testing.assert_allclose(found.means, [[4.0, 1.0], [9.0, 4.5]])
     np.testing.assert_allclose(found.spreads, [[math.sqrt(7.0), 1.0], [0.0, math.sqrt(0.5)]])
     assert found.seeds == [["3/3", "3/3"], ["2/3", "2/3"]]
-    assert "| 4 | 9 ± 0 (2/3) | 4.5 ± 0.71 (2/3) |" in (written / "report.md").read_text()
+    assert "| 4 | 9.00 ± 0.00 (2/3) | 4.50 ± 0.71 (2/3) |" in (written / "report.md").read_text()
     assert (written / "heat_map_1.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -375,7 +375,7 @@ def test_steps_to_the_threshold_with_censoring_and_pairs(tmp_path: Path) -> None
 
     text = build_grid_report(grid, tmp_path / "out").markdown
     assert (
-        "| k=2 | 5.000 | 1/2 finished seeds | 1/2 at 4,000 steps | 2,500 [1,000, 4,000] (2/3) | "
+        "| k=2 | 5.000 | 1/2 | 1/2 at 4,000 steps | 2,500 [1,000, 4,000] (2/3) | "
         "1.67 [1.00, 2.00] (2/3 pairs) |" in text
     )
     assert compare(cells, cells[0], 100.0)[1].ratio is None  # reached by nobody: nothing is known, not a ratio of 1

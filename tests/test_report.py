@@ -319,6 +319,25 @@ def test_configurations_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert all(label.startswith("space ") for label in labels)
 
 
+def test_runs_of_equal_settings_are_one_configuration_whatever_they_are_called(tmp_path: Path) -> None:
+    finished_run(tmp_path / "a", 1.0, seed=0, name="monday")
+    finished_run(tmp_path / "b", 3.0, seed=1, name="tuesday")
+    runs = [load_run(ledger) for ledger in find_ledgers([tmp_path])]
+    assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday + tuesday", 2)]
+    finished_run(tmp_path / "c", 5.0, seed=1, name="monday")  # the same seed twice: now the names tell them apart
+    runs = [load_run(ledger) for ledger in find_ledgers([tmp_path])]
+    assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday", 2), ("tuesday", 1)]
+
+
+def test_a_default_written_out_makes_no_other_configuration(tmp_path: Path) -> None:
+    for seed in range(2):
+        ledger = finished_run(tmp_path / f"s{seed}", 1.0, seed=seed)
+        text = ledger.config.read_text()
+        assert "kappa: 1" in text
+        ledger.config.write_text(text if seed else text.replace("kappa: 1", "kappa: 1, pic: improvement"))
+    assert len(group([load_run(ledger) for ledger in find_ledgers([tmp_path])])) == 1
+
+
 def test_resources_and_tracking_do_not_make_another_configuration(tmp_path: Path) -> None:
     for seed in range(2):
         finished_run(tmp_path / f"s{seed}", 1.0, seed=seed, uri=f"http://host{seed}:1")

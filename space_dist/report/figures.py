@@ -32,6 +32,7 @@ MAX_LABELLED_INSTANCES: Final = 30
 MAX_MARKED: Final = 40  # a line of fewer evaluations shows each: one alone would be invisible
 MAX_WRITTEN: Final = 160  # places of a heat map that still have room for numbers
 _PANEL_COLUMNS: Final = 3
+_PANEL_LABEL: Final = 44  # characters in a line of a panel's legend
 _STEPS_LABEL: Final = "environment steps"
 _RETURN_LABEL: Final = "mean undiscounted return per episode"
 _DPI: Final = 150
@@ -86,10 +87,10 @@ def draw_panels(panels: Sequence[Panel]) -> Figure:
     for axes, panel in zip(grid.flat, panels, strict=False):
         if panel.reference is not None:
             style = {"color": "#777777", "linestyle": "--"}
-            _draw_returns(axes, *panel.reference.returns("test"), _legend(panel.reference), style)
+            _draw_returns(axes, *panel.reference.returns("test"), _legend(panel.reference, _PANEL_LABEL), style)
         for number, configuration in enumerate(panel.configurations):
             style = {"color": COLOURS[number % len(COLOURS)], "linestyle": LINE_STYLES[number // len(COLOURS) % 4]}
-            _draw_returns(axes, *configuration.returns("test"), _legend(configuration), style)
+            _draw_returns(axes, *configuration.returns("test"), _legend(configuration, _PANEL_LABEL), style)
         _dress(axes, _plain(panel.title), _RETURN_LABEL)
         axes.tick_params(labelbottom=True, labelleft=True)
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), frameon=False, fontsize=8)
@@ -118,7 +119,9 @@ class HeatMap:
     def text(self, row: int, column: int) -> str:
         """What is known of a place: `5.10 ± 0.70 (9/10)`; without seeds only how many are missing."""
         mean, spread = self.means[row, column], self.spreads[row, column]
-        number = "—" if math.isnan(mean) else f"{mean:.3g}" + ("" if math.isnan(spread) else f" ± {spread:.2g}")
+        decimals = 2 if abs(mean) < 100 else 1 if abs(mean) < 10_000 else 0
+        number = "—" if math.isnan(mean) else f"{mean:,.{decimals}f}"
+        number += "" if math.isnan(spread) else f" ± {spread:,.{decimals}f}"
         return f"{number} ({self.seeds[row][column]})" if self.seeds[row][column] else "—"
 
 
@@ -256,8 +259,8 @@ def _plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _legend(configuration: Configuration) -> str:
-    words = f"{textwrap.fill(configuration.label, 60, max_lines=3)} ({_seed_count(configuration)})"
+def _legend(configuration: Configuration, width: int = 60) -> str:
+    words = f"{textwrap.fill(configuration.label, width, max_lines=3)} ({_seed_count(configuration)})"
     return _plain(f" {words}" if words.startswith("_") else words)  # Matplotlib hides labels that begin so
 
 

@@ -70,11 +70,12 @@ class CellRuns:
         return dict(_flattened(self.cell.settings))
 
     def times(self, threshold: float) -> dict[int, float]:
-        """Per finished seed, the step at which it reached the threshold; NaN if it never did."""
-        return {
+        """Per finished seed, the step at which it reached the threshold; NaN if it did not within the budget."""
+        found = {
             run.status.seed: steps_to_threshold(run.evaluation_steps, run.test["return"], threshold)
             for run in self.configuration.finished
         }
+        return {seed: time if time <= self.cell.budget_steps else math.nan for seed, time in found.items()}
 
 
 @dataclass(frozen=True)

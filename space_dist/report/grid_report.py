@@ -103,6 +103,11 @@ def build_grid_report(
         raise ConfigError(f"--threshold must be a finite number, not {threshold}")
     manifest = grid.manifest()
     chosen = manifest.baseline if baseline is None else manifest.cell(baseline).id
+    folder = grid.folder / "report" if out is None else out
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # before the work, which takes a while for a large grid
+    except OSError as error:
+        raise _unwritable(folder, error) from None
     cells = read_cells(grid, manifest)
     reference = next((cell for cell in cells if cell.cell.id == chosen), None)
     if reference is None:
@@ -128,7 +133,6 @@ def build_grid_report(
         ],
     )
     markdown = to_markdown(document)
-    folder = grid.folder / "report" if out is None else out
     files = {
         **{picture.file: picture.png for section in document.sections for picture in section.pictures},
         "cells.csv": to_csv([_numbers(*pair) for pair in zip(cells, compared, strict=True)]).encode(),
@@ -137,15 +141,18 @@ def build_grid_report(
         "report.html": to_html(document).encode(),
     }
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             atomic_write(folder / name, content)
     except OSError as error:
-        raise ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}") from None
+        raise _unwritable(folder, error) from None
     table = [
         _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
     ]
     return GridReport(folder, summary, table, remarks, markdown)
+
+
+def _unwritable(folder: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}")
 
 
 # ---- sentences ------------------------------------------------------------------------------------------------------
@@ -213,7 +220,7 @@ def _finals(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[d
                 "IQM [95 %]": _with_seeds(interval_text(test.iqm), test.n, of),
                 "mean [95 %]": _with_seeds(interval_text(test.mean), test.n, of),
                 "median [95 %]": _with_seeds(interval_text(test.median), test.n, of),
-                "P(better than the baseline) [95 %]": _improvement(cell, comparison),
+                "P(better) [95 %]": _improvement(cell, comparison),
             }
         )
     return rows
@@ -234,7 +241,7 @@ def _steps_row(cell: CellRuns, comparison: Comparison) -> dict[str, str]:
         return row | {"reached by": NONE, "censored": NONE, "steps, restricted mean [95 %]": comparison.untestable,
                       "ratio to the baseline [95 %]": NONE}  # fmt: skip
     n = len(reach.times)
-    row["reached by"] = f"{n - reach.censored}/{n} finished seeds"
+    row["reached by"] = f"{n - reach.censored}/{n}"
     row["censored"] = f"{reach.censored}/{n} at {reach.budget:,} steps" if reach.censored else f"0/{n}"
     row["steps, restricted mean [95 %]"] = _with_seeds(interval_text(reach.mean, 0), n, of)
     row["ratio to the baseline [95 %]"] = _ratio(comparison, of)
@@ -271,7 +278,7 @@ def _short_row(cell: CellRuns, comparison: Comparison, final: dict[str, str]) ->
         "seeds": final["seeds finished"],
         "not finished": final["not finished"],
         "test return, IQM [95 %]": final["IQM [95 %]"],
-        "P(better)": final["P(better than the baseline) [95 %]"],
+        "P(better)": final["P(better) [95 %]"],
         "steps to the threshold": steps,
         "ratio": _ratio(comparison, cell.summary.n_runs),
     }
@@ -346,9 +353,9 @@ def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
     """Cells that differ only by the grid's last setting in one panel, where that is few enough; else six and six."""
     keys = varying(cells)
     groups = grouped(cells, keys[:-1])
-    if max(map(len, groups.values())) > _CURVES_PER_PANEL or len(groups) * 3 > len(cells):
-        parts = [list(cells[at : at + _CURVES_PER_PANEL]) for at in range(0, len(cells), _CURVES_PER_PANEL)]
-        groups = {(f"cells {_CURVES_PER_PANEL * number + 1} and on",): part for number, part in enumerate(parts)}
+    if max(map(len, groups.values())) > _CURVES_PER_PANEL or len(groups) * 2.5 > len(cells):
+        parts = {at: list(cells[at : at + _CURVES_PER_PANEL]) for at in range(0, len(cells), _CURVES_PER_PANEL)}
+        groups = {(f"cells {at + 1} to {at + len(part)}",): part for at, part in parts.items()}
 
     def curves(members: Sequence[CellRuns]) -> list[Configuration]:
         return [cell.configuration for cell in members if cell is not baseline]
