@@ -150,12 +150,10 @@ def compare(cells: Sequence[CellRuns], baseline: CellRuns, threshold: float | No
     """Each cell against its reference. `threshold`: of the test return; None: each reference's final IQM."""
     references = {task: _reference(cells, baseline, task) for task in {cell.task for cell in cells}}
     found = [_compare(cell, references[cell.task], threshold) for cell in cells]
-    tested = [number for number, comparison in enumerate(found) if comparison.reach is not None]
-    times = [restricted(reach.times, reach.budget) for number in tested if (reach := found[number].reach)]
-    for number, interval in zip(tested, intervals(times, mean), strict=True):
-        reach = found[number].reach
-        if reach is not None:
-            found[number] = dataclasses.replace(found[number], reach=dataclasses.replace(reach, mean=interval))
+    tested = {number: reach for number, comparison in enumerate(found) if (reach := comparison.reach) is not None}
+    means = intervals([restricted(reach.times, reach.budget) for reach in tested.values()], mean)  # all cells at once
+    for (number, reach), interval in zip(tested.items(), means, strict=True):
+        found[number] = dataclasses.replace(found[number], reach=dataclasses.replace(reach, mean=interval))
     return found
 
 
@@ -221,7 +219,7 @@ def _flattened(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[
 
 
 def _is_of_task(key: str) -> bool:
-    return key.partition(".")[0] in ("env", "instances")
+    return key.partition(".")[0] in ("env", "instances") and key != "env.context_visible"
 
 
 def word(value: Any) -> str:
@@ -232,10 +230,9 @@ def word(value: Any) -> str:
 def varying(cells: Sequence[CellRuns]) -> list[str]:
     """The settings in which cells differ, in the grid's order."""
     keys = dict.fromkeys(key for cell in cells for key in cell.settings)
-    missing = object()
     return [
-        key for key in keys if len({json.dumps(value) if value is not missing else "" for cell in cells
-                                    for value in [cell.settings.get(key, missing)]}) > 1
+        key for key in keys
+        if len({json.dumps(cell.settings[key]) if key in cell.settings else "" for cell in cells}) > 1
     ]  # fmt: skip
 
 
