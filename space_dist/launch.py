@@ -46,8 +46,8 @@ class Outcome:
 
 
 def default_folder(config: RunConfig) -> Path:
-    """`runs/<name>/s<seed>` in the current folder."""
-    return Path("runs") / config.name / f"s{config.seed}"
+    """`runs/<name>/s<seed>`, here."""
+    return workplace() / "runs" / config.name / f"s{config.seed}"
 
 
 def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
@@ -165,7 +165,30 @@ def _self_contained(config: RunConfig) -> RunConfig:
 def absolute_uri(uri: str | None) -> str | None:
     """A tracking URI that means the same from any folder: `sqlite:///FILE` with the file's absolute path."""
     prefix = "sqlite:///"
-    return f"{prefix}{Path(uri.removeprefix(prefix)).absolute()}" if uri and uri.startswith(prefix) else uri
+    return f"{prefix}{workplace() / uri.removeprefix(prefix)}" if uri and uri.startswith(prefix) else uri
+
+
+def in_ray_job() -> bool:
+    """Whether `ray job submit` started this process."""
+    return "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
+
+
+def workplace() -> Path:
+    """Where results go whose place nobody named: here; from within a Ray job, `~/space_dist`.
+
+    A job's current folder is a copy that Ray removes when it needs the space.
+    """
+    return Path.home() / "space_dist" if in_ray_job() else Path.cwd()
+
+
+def lasting(path: Path, option: str) -> Path:
+    """The absolute path of a folder for results. Raises ConfigError for a relative one from within a Ray job."""
+    if in_ray_job() and not path.is_absolute():
+        raise ConfigError(
+            f"{option} {path}: from within a Ray job the path must be absolute, on storage that outlives the job; "
+            "the job's current folder is a copy that Ray removes when it needs the space"
+        )
+    return path.absolute()
 
 
 def policy_of(ledger: Ledger) -> Policy:

@@ -212,11 +212,16 @@ class Ledger:
 
     def owner_alive(self) -> bool:
         """Whether a live process works on this run now, as far as can be told from this machine."""
-        try:
-            owner = json.loads(self.lock_file.read_bytes() or b"{}")
-        except (OSError, ValueError, RecursionError):
-            return False
-        return isinstance(owner, dict) and believed_alive(owner)
+        return owner_alive(self.lock_file)
+
+
+def owner_alive(lock_file: Path) -> bool:
+    """Whether a live process holds the lock, as far as can be told from this machine."""
+    try:
+        owner = json.loads(lock_file.read_bytes() or b"{}")
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(owner, dict) and believed_alive(owner)
 
 
 def find_ledgers(paths: list[Path]) -> list[Ledger]:

@@ -26,7 +26,7 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
-from space_dist.ledger import Ledger, atomic_write
+from space_dist.ledger import Ledger, atomic_write, owner_alive
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -99,7 +99,7 @@ class GridTracking(Section):
         return configs.checked_uri(value)
 
 
-Axes = dict[str, tuple[Any, ...]]
+Axes = dict[str, list[Any]]
 
 
 class GridConfig(Section):
@@ -111,9 +111,9 @@ class GridConfig(Section):
     """The run config (YAML) that cells start from, relative to this file; several: an axis of their own."""
     set: dict[str, Any] = Field(default={})
     """Config keys and values for every cell."""
-    grid: Axes = Field(default={}, strict=False)
+    grid: Axes = Field(default={})
     """Axes by config key: all combinations. A value may be a whole section: curriculum: [{kind: space}, ...]."""
-    zip: Axes = Field(default={}, strict=False)
+    zip: Axes = Field(default={})
     """Axes of equal length that go together: first values with first values, and so on."""
     exclude: tuple[dict[str, Any], ...] = Field(default=(), strict=False)
     """Cells to leave out: all those that have every key and value of an entry."""
@@ -444,6 +444,10 @@ class Grid:
             if hashlib.sha256(files[name]).hexdigest() != sha256:
                 raise LedgerError(f"{path} has changed since the grid was frozen")
         return files
+
+    def owner_alive(self) -> bool:
+        """Whether somebody is working on the grid now, as far as can be told from this machine."""
+        return owner_alive(self.lock_file)
 
     def ledger(self, run: Run) -> Ledger:
         """Where a run's results are, or will be."""

@@ -91,6 +91,11 @@ class Attempts:
         """It has ended."""
         self._append({"event": "end", "attempt": attempt, "cause": ended.cause, "detail": ended.detail[-MAX_DETAIL:]})
 
+    def sign(self) -> None:
+        """A sign of life of the supervisor: the file's time."""
+        with contextlib.suppress(OSError):
+            os.utime(self.path)
+
     def forgive(self) -> None:
         """A user asks for another try: earlier ends no longer count."""
         self._append({"event": "retry"})
@@ -122,6 +127,12 @@ class Attempts:
             raise LedgerError(f"{self.path} cannot be read: {error.strerror}") from None
         return [row for line in content.splitlines(keepends=True) if (row := decode_row(line)) is not None]
 
+    def last_sign(self) -> float:
+        """When a supervisor last gave one, in seconds since the epoch."""
+        with contextlib.suppress(OSError):
+            return self.path.stat().st_mtime
+        return 0.0
+
     def history(self) -> History:
         """What the rows say."""
         begun, last, where = 0, None, dict[str, Any]()
@@ -130,7 +141,7 @@ class Attempts:
             with contextlib.suppress(KeyError, ValueError, TypeError):  # rows of a later version
                 if row["event"] == "begin":
                     begun, last = max(begun, int(row["attempt"])), None
-                    where = {**row["where"], "heartbeat": row["unix_time"]}
+                    where = {**row["where"], "heartbeat": max(row["unix_time"], self.last_sign())}
                 elif row["event"] == "end":
                     begun = max(begun, int(row["attempt"]))
                     last = Ended(None if row["cause"] is None else Cause(row["cause"]), str(row["detail"]))
@@ -138,7 +149,7 @@ class Attempts:
                         ends[last.cause] += 1
                 elif row["event"] == "retry":
                     ends.clear()
-                    last = None
+                    last = Ended(None)
         return History(begun, last, ends, where)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import typer
 
 from space_dist.cli import runs
+from space_dist.cli.grids import grid_app
 from space_dist.cli.inputs import config_app, instances_app
 from space_dist.errors import SpaceDistError
 
@@ -20,6 +21,7 @@ app = typer.Typer(
 )  # fmt: skip
 for _command in (runs.train, runs.evaluate, runs.report, runs.sync):
     app.command()(_command)
+app.add_typer(grid_app, name="grid")
 app.add_typer(instances_app, name="instances")
 app.add_typer(config_app, name="config")
 

@@ -43,13 +43,13 @@ def train(
     """Train one policy under one curriculum."""
     STOP.install()
     from space_dist import config as configs
-    from space_dist.launch import about, default_folder, launch
+    from space_dist.launch import about, default_folder, lasting, launch
 
     settings = list(overrides or [])
     if workers is not None:
         settings.append(f"resources.workers={workers}")
     run = configs.load(config, settings, seed=seed)
-    folder = out if out is not None else default_folder(run)
+    folder = lasting(out, "--out") if out is not None else default_folder(run)
     with about(str(config)), _display(run.name, run.seed) as observe:
         outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe)
     status = outcome.ledger.status()
