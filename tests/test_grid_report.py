@@ -416,6 +416,7 @@ def test_a_grid_without_a_finished_run_says_so(tmp_path: Path) -> None:
         "6 waiting." in report.markdown
     )
     assert not (report.folder / "curves.png").exists()
+    assert "Steps to the threshold" not in report.markdown
     finish(grid, 1, 0, -1.0, 0.0, state="interrupted")
     report = build_grid_report(grid)
     assert report.summary[0].startswith("No run of this grid has finished yet")

@@ -17,6 +17,7 @@ from space_dist.cli.terminal import STOP, Overrides, Runs, console, say, warn, w
 from space_dist.errors import ConfigError
 
 if TYPE_CHECKING:
+    from space_dist.manifest import Grid
     from space_dist.report import GridReport, Report
     from space_dist.training import Progress
 
@@ -126,15 +127,17 @@ def report(
         Optional[float],  # noqa: UP045
         typer.Option(help="Of a grid: steps to this test return; default: to the baseline's final IQM."),
     ] = None,
-    root: Annotated[Path, typer.Option(help="Of a grid's YAML file: where grids are frozen.")] = Path("runs"),
+    root: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Of a grid's YAML file: folder that holds the grids' folders, as of `space-dist grid`."),
+    ] = None,
 ) -> None:
     """Compare runs, or the cells of a grid: figures and tables with 95 % bootstrap intervals over seeds."""
     from space_dist.ledger import find_ledgers
-    from space_dist.manifest import find_grid
     from space_dist.report import build_grid_report, build_report
 
     if len(paths) == 1 and _is_grid(paths[0]):
-        grid = find_grid(paths[0], root)
+        grid = _grid(paths[0], root)
         print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
         return
     if grids := [path for path in paths if _is_grid(path)]:
@@ -148,6 +151,16 @@ def _is_grid(path: Path) -> bool:
     from space_dist.manifest import MANIFEST
 
     return (path / MANIFEST).is_file() or (not path.is_dir() and (path.name == MANIFEST or path.suffix in _YAML))
+
+
+def _grid(path: Path, root: Path | None) -> Grid:
+    from space_dist.manifest import find_grid
+
+    if root is None and path.suffix in _YAML:  # only then, for this imports torch
+        from space_dist.launch import workplace
+
+        root = workplace() / "runs"
+    return find_grid(path, root or Path())
 
 
 def print_report(result: Report, to: Console) -> None:

@@ -117,21 +117,21 @@ def build_grid_report(
     summary = _summary(manifest, cells, reference, compared, threshold)
     remarks = _remarks(manifest, cells, compared)
     finals = _finals(cells, compared)
-    document = Document(
-        f"Grid {manifest.name}",
-        [
-            Section("", summary),
-            Section("Final return on the held-out instances", rows=finals),
-            *_failed(cells),
+    sections = [
+        Section("", summary),
+        Section("Final return on the held-out instances", rows=finals),
+        *_failed(cells),
+        *_curves(cells, reference),
+    ]
+    if any(cell.summary.n_finished for cell in cells):
+        sections += [
             Section("Steps to the threshold", rows=[_steps_row(*pair) for pair in zip(cells, compared, strict=True)]),
-            *_curves(cells, reference),
             *_maps(cells),
             *_pooled(cells),
             Section("Training", rows=[_training_row(cell) for cell in cells]),
-            *([Section("Remarks", items=remarks)] if remarks else []),
-            Section("How to read this", _METHOD),
-        ],
-    )
+        ]
+    sections += [Section("Remarks", items=remarks)] if remarks else []
+    document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
     markdown = to_markdown(document)
     files = {
         **{picture.file: picture.png for section in document.sections for picture in section.pictures},
