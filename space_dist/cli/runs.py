@@ -72,9 +72,8 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
-    from space_dist import config as configs
     from space_dist.instances import read_csv
-    from space_dist.launch import policy_of
+    from space_dist.launch import policy_of, stored_config
     from space_dist.ledger import Ledger
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
@@ -82,7 +81,7 @@ def evaluate(
 
     ledger = Ledger(run)
     status = ledger.status()
-    config = configs.load(ledger.config)
+    config = stored_config(ledger)
     policy = policy_of(ledger)
     chosen = read_csv(instances, make_env(config).context_bounds)
     env = make_env(config, len(chosen))

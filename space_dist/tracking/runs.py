@@ -453,6 +453,7 @@ class Store:
                 for figure in _draw(ledger, Path(folder)):
                     self._client.log_artifact(run.info.run_id, str(figure), "figures")
         for file in files:
+            ledger.read(file)  # is it what the run wrote?
             self._client.log_artifact(run.info.run_id, str(file))
         self._client.set_tag(run.info.run_id, ARTIFACTS_TAG, wanted)
 
