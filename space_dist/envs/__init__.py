@@ -10,6 +10,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from space_dist.envs.antgoal import BatchedAntGoal
+from space_dist.envs.ballcatching import BatchedBallCatching
 from space_dist.envs.cartpole import BatchedCartPole
 from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
 from space_dist.envs.observations import Observations
@@ -21,6 +23,8 @@ from space_dist.instances import ContextBounds
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
     "space_dist/CartPole-v0": BatchedCartPole,
+    "space_dist/AntGoal-v0": BatchedAntGoal,
+    "space_dist/BallCatching-v0": BatchedBallCatching,
 }
 
 
@@ -90,6 +94,8 @@ def _find(env_id: str) -> Callable[[int], Any]:
 
 
 __all__ = [
+    "BatchedAntGoal",
+    "BatchedBallCatching",
     "BatchedCartPole",
     "BatchedEnv",
     "BatchedPointMass",
