@@ -40,7 +40,7 @@ N_JOINTS: Final = 5  # Klink: two of seven are fixed
 # The iiwa: A1 is fixed where the arm's plane is that of y and z, A3 where it stays one. Positions in radians.
 FIXED: Final = {"lbr_iiwa_joint_1": -math.pi / 2, "lbr_iiwa_joint_3": 0.0}
 BASE_HEIGHT: Final = SHOULDER_HEIGHT - 0.36  # A2 is 0.36 m above the base
-HOME: Final = (0.5236, -1.5708, 0.0, 0.5236, 0.0)  # of A2, A4, A5, A6, A7; ours: the net below all targets
+HOME: Final = (0.4363, -1.3963, 0.0, 0.4363, 0.0)  # of A2, A4, A5, A6, A7; ours: the net just below the targets
 RATE: Final = 4.0  # rad/s of the desired position at action 1; ours
 POSITION_GAIN: Final = 0.1  # of Bullet's joint motors, per physics step: a time constant of 20 ms; Bullet's default
 VELOCITY_GAIN: Final = 1.0  # Bullet's default

@@ -197,8 +197,8 @@ class BatchedBullet(Generic[Episode]):
         for slot in range(self.n_slots):
             world = self._at_home(slot)
             told = world.act(self._episodes[slot], chosen[slot])
+            self._time[slot] += 1  # from now on the episode cannot simply be begun again
             observations[slot], rewards[slot], terminated[slot], success[slot] = told
-        self._time += 1
         truncated = (self._time >= self.horizon) & ~terminated
         return Step(observations, rewards, terminated, truncated, success if self.knows_success else None)
 
