@@ -54,6 +54,8 @@ def make_batched(
             raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
     try:
         env: BatchedEnv = make(n_slots, **kwargs)
+    except ConfigError as error:
+        raise ConfigError(f"env.id {env_id!r} cannot be made: {error}") from None
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
         raise ConfigError(f"env.id {env_id!r} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")

@@ -175,5 +175,3 @@ class BatchedAntGoal(BatchedBullet[AntEpisode]):
         self.context_bounds = ANTGOAL_BOUNDS
         self.knows_success = False
         super().__init__(n_slots, horizon, AntWorld)
-
-

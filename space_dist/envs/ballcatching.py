@@ -140,7 +140,8 @@ class BallWorld(World[BallEpisode]):
         """Cosine of the angle between the net's normal and the way that the ball came; 1 is head on."""
         x, y, z, w = self._link_state(self._arm, self._net)[1]
         normal = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))  # the link's y axis
-        return -sum(n * v for n, v in zip(normal, velocity, strict=True)) / math.hypot(*velocity)
+        along = sum(n * v for n, v in zip(normal, velocity, strict=True))
+        return float(-along / math.hypot(*velocity))
 
     def _observe(self, episode: BallEpisode) -> NDArray[np.float32]:
         states = self._joint_states(self._arm, self._joints)

@@ -7,7 +7,7 @@ more of them than `MAX_WORLDS`.
 An episode must not be able to tell. Bullet keeps more than positions and velocities: contact points with the impulses
 that the solver starts from, and the order of overlapping pairs. So the world is saved after loading, and every
 episode, the first one included, begins by restoring that. Where slots share a world, its whole state is saved and
-restored between their steps. Both give the same bits (`tests/test_antgoal.py`, `tests/test_ballcatching.py`).
+restored between their steps. Both give the same bits (`tests/test_bullet.py`).
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds
 
 MAX_WORLDS = 32
-"""Worlds of one batched environment, at most: about 1 GB. Slots that share one pay 1 ms a step for changing places.
+"""Worlds of one batched environment, at most: about 1 GB. PyBullet itself allows 1,024 clients in a process.
 
-PyBullet itself allows 1,024 clients in a process.
+Slots that share one pay 1 to 3 ms a step for changing places.
 """
 
 Episode = TypeVar("Episode")
@@ -48,8 +48,7 @@ def pybullet() -> Any:
         try:
             import pybullet as module
         except ImportError as error:
-            raise ConfigError(f"env.id: this environment needs the package pybullet, which does not import: {error}")\
-                from None  # fmt: skip
+            raise ConfigError(f"it needs the package pybullet, which cannot be imported: {error}") from None
     return module
 
 
