@@ -134,7 +134,7 @@ class BallWorld(World[BallEpisode]):
         return self._observe(episode), reward, touched, caught
 
     def camera(self) -> Camera:
-        return Camera(target=(0.6, -0.3, 0.9), distance=2.6, yaw=60.0, pitch=-15.0)
+        return Camera(target=(0.4, -0.3, 0.9), distance=1.9, yaw=60.0, pitch=-15.0)
 
     def _alignment(self, velocity: tuple[float, float, float]) -> float:
         """Cosine of the angle between the net's normal and the way that the ball came; 1 is head on."""
