@@ -435,6 +435,25 @@ CARTPOLE_BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), h
 four of `cartpole_test.csv` are ours: one between each two of them, and one beyond each end.
 """
 
+ANTGOAL_BOUNDS: Final = ContextBounds(
+    names=("goal_x", "goal_y", "disabled_leg"),
+    low=np.array([-750.0, -750.0, -1.0]),
+    high=np.array([750.0, 750.0, 3.0]),
+)
+"""AntGoal (Eimer et al. 2021): the goal in metres from the start, and the disabled leg, a whole number: -1 for none."""
+
+BALLCATCHING_BOUNDS: Final = ContextBounds(
+    names=("angle", "radius", "distance"),
+    low=np.array([0.125 * np.pi, 0.52, 0.75]),
+    high=np.array([0.5 * np.pi, 0.95, 4.0]),
+)
+"""BallCatching (Klink et al. 2020): angle in radians and radius in metres of the point that the ball flies to, seen
+from the arm's shoulder, and the distance in metres from which it comes.
+
+Klink et al. have radii from 0.6 to 1.1 for their longer arm: ours are these times 0.95 / 1.1, because the net's centre
+reaches 1.07 m.
+"""
+
 
 @dataclass(frozen=True)
 class Distribution:
@@ -460,6 +479,12 @@ def _draw_pointmass_target(rng: np.random.Generator, n: int) -> NDArray[np.float
     return np.clip(drawn, POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high)
 
 
+def _draw_antgoal(rng: np.random.Generator, n: int, nearest_goal: float) -> NDArray[np.float64]:
+    """Goals uniform between `nearest_goal` and 750 on each axis; none or one of four legs, each as likely."""
+    goals = rng.uniform(nearest_goal, ANTGOAL_BOUNDS.high[:2], size=(n, 2))
+    return np.column_stack((goals, rng.integers(-1, 4, size=n)))
+
+
 DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
     "pointmass_uniform": Distribution(
         description="PointMass, each feature uniform within its bounds",
@@ -479,6 +504,26 @@ DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
         source="ours; the paper has only the three poles of cartpole_train.csv and no test set",
         bounds=CARTPOLE_BOUNDS,
         draw=lambda rng, n: rng.uniform(CARTPOLE_BOUNDS.low, CARTPOLE_BOUNDS.high, size=(n, 1)),
+    ),
+    "antgoal_positive": Distribution(
+        description="AntGoal, goals uniform in the positive quadrant up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021; the quadrant is the released code's",
+        bounds=ANTGOAL_BOUNDS,
+        draw=lambda rng, n: _draw_antgoal(rng, n, 0.0),
+    ),
+    "antgoal_all": Distribution(
+        description="AntGoal, goals uniform in all four quadrants up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021 (goals at most 750 away)",
+        bounds=ANTGOAL_BOUNDS,
+        draw=lambda rng, n: _draw_antgoal(rng, n, -750.0),
+    ),
+    "ballcatching_uniform": Distribution(
+        description="BallCatching, each feature uniform within its bounds",
+        source="Klink et al. 2020 (the bounds); the radius is scaled to our arm",
+        bounds=BALLCATCHING_BOUNDS,
+        draw=lambda rng, n: rng.uniform(BALLCATCHING_BOUNDS.low, BALLCATCHING_BOUNDS.high, size=(n, 3)),
     ),
 }
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from space_dist.envs.antgoal import BatchedAntGoal
+from space_dist.envs.ballcatching import BatchedBallCatching
 from space_dist.envs.cartpole import BatchedCartPole
 from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
 from space_dist.envs.observations import Observations
@@ -21,6 +23,8 @@ from space_dist.instances import ContextBounds
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
     "space_dist/CartPole-v0": BatchedCartPole,
+    "space_dist/AntGoal-v0": BatchedAntGoal,
+    "space_dist/BallCatching-v0": BatchedBallCatching,
 }
 
 
@@ -50,6 +54,8 @@ def make_batched(
             raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
     try:
         env: BatchedEnv = make(n_slots, **kwargs)
+    except ConfigError as error:
+        raise ConfigError(f"env.id {env_id!r} cannot be made: {error}") from None
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
         raise ConfigError(f"env.id {env_id!r} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
@@ -90,6 +96,8 @@ def _find(env_id: str) -> Callable[[int], Any]:
 
 
 __all__ = [
+    "BatchedAntGoal",
+    "BatchedBallCatching",
     "BatchedCartPole",
     "BatchedEnv",
     "BatchedPointMass",

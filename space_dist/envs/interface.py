@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces
@@ -65,6 +65,14 @@ class BatchedEnv(Protocol):
 
     def step(self, actions: NDArray[np.generic]) -> Step:
         """Step every slot. actions: (n_slots, *action_shape). A slot whose episode has ended must be reset first."""
+
+
+@runtime_checkable
+class Closable(Protocol):
+    """A batched environment that holds more than memory of Python's."""
+
+    def close(self) -> None:
+        """Free it. May be called twice; `reset` afterwards takes it anew."""
 
 
 MakeBatched = Callable[[int], BatchedEnv]

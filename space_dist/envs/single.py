@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.interface import MakeBatched
+from space_dist.envs.interface import Closable, MakeBatched
 from space_dist.envs.observations import each
 
 
@@ -60,6 +60,11 @@ class SingleEnv(gym.Env[Any, Any]):
             bool(step.truncated[0]),
             info,
         )
+
+    def close(self) -> None:
+        """Free what the environment holds outside Python, if anything."""
+        if isinstance(self._env, Closable):
+            self._env.close()
 
     def _draw_context(self) -> NDArray[np.float64]:
         bounds = self._env.context_bounds
