@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import ConfigError, nearest
+from space_dist.mazes import CELLS, SIDE, carve, symmetrised
 from space_dist.seeding import Purpose, generator
 
 MAX_FILE_BYTES: Final = 512 * 2**20
@@ -435,15 +436,26 @@ CARTPOLE_BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), h
 four of `cartpole_test.csv` are ours: one between each two of them, and one beyond each end.
 """
 
+MAZE_BOUNDS: Final = ContextBounds(
+    names=tuple(f"cell_{x}_{y}" for y in range(SIDE) for x in range(SIDE)),
+    low=np.zeros(CELLS),
+    high=np.full(CELLS, 15.0),
+)
+"""Maze: the bits of each cell's open sides (north 1, east 2, south 4, west 8), in reading order; `cell_x_y`."""
+
 
 @dataclass(frozen=True)
 class Distribution:
-    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows."""
+    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows.
+
+    `content` turns `(n, d)` contexts into rows that are equal where two contexts mean the same.
+    """
 
     description: str
     source: str
     bounds: ContextBounds
     draw: Callable[[np.random.Generator, int], NDArray[np.float64]]
+    content: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda contexts: contexts
 
 
 def _draw_pointmass_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
@@ -480,6 +492,20 @@ DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
         bounds=CARTPOLE_BOUNDS,
         draw=lambda rng, n: rng.uniform(CARTPOLE_BOUNDS.low, CARTPOLE_BOUNDS.high, size=(n, 1)),
     ),
+    "maze_dfs": Distribution(
+        description="Maze, perfect 5x5 mazes carved depth first from a random cell, symmetrised",
+        source="gym-maze's generator; the paper released no settings",
+        bounds=MAZE_BOUNDS,
+        draw=carve,
+    ),
+    "maze_dfs_raw": Distribution(
+        description="Maze, the mazes of maze_dfs with the released code's numbers, which depend on where the carving "
+        "began",
+        source="gym-maze's generator",
+        bounds=MAZE_BOUNDS,
+        draw=lambda rng, n: carve(rng, n, raw=True),
+        content=symmetrised,
+    ),
 }
 
 
@@ -508,7 +534,7 @@ def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[Ins
     contexts = np.empty((0, len(chosen.bounds.names)))
     for _ in range(MAX_REDRAWS):
         contexts = np.vstack((contexts, chosen.draw(rng, total - len(contexts))))
-        contexts = np.delete(contexts, _repeats(contexts)[1], axis=0)
+        contexts = np.delete(contexts, _repeats(chosen.content(contexts))[1], axis=0)
         if len(contexts) == total:
             ids, names = np.arange(total), chosen.bounds.names
             train = InstanceSet(ids[:n_train], contexts[:n_train], names)

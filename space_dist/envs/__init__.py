@@ -12,6 +12,7 @@ import gymnasium as gym
 
 from space_dist.envs.cartpole import BatchedCartPole
 from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
+from space_dist.envs.maze import BatchedMaze
 from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
@@ -21,6 +22,7 @@ from space_dist.instances import ContextBounds
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
     "space_dist/CartPole-v0": BatchedCartPole,
+    "space_dist/Maze-v0": BatchedMaze,
 }
 
 
@@ -92,6 +94,7 @@ def _find(env_id: str) -> Callable[[int], Any]:
 __all__ = [
     "BatchedCartPole",
     "BatchedEnv",
+    "BatchedMaze",
     "BatchedPointMass",
     "ContextObservation",
     "ContextVisible",
