@@ -70,7 +70,7 @@ def test_the_shipped_mazes_are_perfect_solvable_disjoint_and_all_different_paths
             assert passages(layout) == 24  # and in one way only
     routes = {tuple(search(layout)[4, 4]) for one in sets for layout in one.contexts}
     assert len(routes) > 100  # not one way for all
-    assert [one.to_csv() for one in sample("maze_dfs", 100, 100, 1)] == [one.to_csv() for one in sets]
+    assert [one.to_csv() for one in sample("maze_dfs", 100, 100, 0)] == [one.to_csv() for one in sets]
 
 
 @pytest.mark.parametrize("raw", [False, True])

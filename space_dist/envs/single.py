@@ -16,8 +16,8 @@ from space_dist.envs.observations import each
 class SingleEnv(gym.Env[Any, Any]):
     """Contexts come with `reset(options={"context": array})` and stay until another one is given.
 
-    Without any, the context is drawn at each reset: uniformly from `context_space`, unless the environment draws it. The first call of `reset` without a
-    seed takes one from the operating system, as Gymnasium prescribes.
+    Without any, one is drawn at each reset: by the environment, or uniformly from `context_space`. The first call of
+    `reset` without a seed takes one from the operating system, as Gymnasium prescribes.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
@@ -63,7 +63,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _draw_context(self) -> NDArray[np.float64]:
         if isinstance(self._env, DrawsContexts):
-            return self._env.draw_contexts(self.np_random, 1)[0]
+            return _first(self._env.draw_contexts(self.np_random, 1))
         bounds = self._env.context_bounds
         return self.np_random.uniform(bounds.low, bounds.high)
 
