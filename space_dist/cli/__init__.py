@@ -12,6 +12,7 @@ import typer
 
 from space_dist.cli import runs
 from space_dist.cli.inputs import config_app, instances_app
+from space_dist.cli.worlds import env_app
 from space_dist.errors import SpaceDistError
 
 app = typer.Typer(
@@ -22,6 +23,7 @@ for _command in (runs.train, runs.evaluate, runs.report, runs.sync):
     app.command()(_command)
 app.add_typer(instances_app, name="instances")
 app.add_typer(config_app, name="config")
+app.add_typer(env_app, name="env")
 
 
 def main() -> None:
