@@ -509,17 +509,20 @@ DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
 }
 
 
-def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[InstanceSet, InstanceSet]:
-    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), drawn from one of `DISTRIBUTIONS`.
+def sample(
+    distribution: str, n_train: int, n_test: int, seed: int, known: Mapping[str, Distribution] | None = None
+) -> tuple[InstanceSet, InstanceSet]:
+    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), from one of the `known` (DISTRIBUTIONS).
 
     They are disjoint by construction: one set of distinct contexts is drawn, what repeats drawn again, and then
-    split. A pure function of all four arguments. Raises ConfigError for an unknown distribution, for counts below 1
+    split. A pure function of its arguments. Raises ConfigError for an unknown distribution, for counts below 1
     or above 10 million together, for a negative seed, and if there are not that many distinct contexts to be found.
     """
-    if distribution not in DISTRIBUTIONS:
+    known = DISTRIBUTIONS if known is None else known
+    if distribution not in known:
         raise ConfigError(
-            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], DISTRIBUTIONS)} "
-            f"(known are {', '.join(DISTRIBUTIONS)})"
+            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], known)} "
+            f"(known are {', '.join(known)})"
         )
     total = n_train + n_test
     if min(n_train, n_test) < 1 or total > MAX_INSTANCES:
@@ -529,7 +532,7 @@ def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[Ins
         )
     if seed < 0:
         raise ConfigError(f"the seed {seed} is negative; allowed are whole numbers from 0")
-    chosen = DISTRIBUTIONS[distribution]
+    chosen = known[distribution]
     rng = generator(seed, Purpose.INSTANCES, int.from_bytes(distribution.encode(), "big"), n_train, n_test)
     contexts = np.empty((0, len(chosen.bounds.names)))
     for _ in range(MAX_REDRAWS):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections import deque
@@ -13,8 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from space_dist import cli
+from space_dist.cli import runs
 from space_dist.envs import BatchedMaze, ContextObservation, ContextVisible
 from space_dist.instances import MAZE_BOUNDS, InstanceSet, read_csv, refuse_overlap, sample
+from space_dist.interrupts import StopRequests
 from space_dist.mazes import carve, shortest_ways, symmetrised
 
 ENV_ID = "space_dist/Maze-v0"
@@ -221,6 +225,7 @@ def test_half_a_wall_is_refused() -> None:
 
 WALK = """
 import gymnasium, numpy, space_dist.envs
+from space_dist.interrupts import StopRequests
 from space_dist.mazes import carve
 env = gymnasium.make("space_dist/Maze-v0")
 env.reset(seed=5, options={"context": carve(numpy.random.default_rng(7), 1)[0]})
@@ -235,3 +240,29 @@ def test_another_process_carves_and_walks_the_same() -> None:
     here = [env.step(np.array([action])).observations[0].tolist()
             for action in np.random.default_rng(8).integers(4, size=60)]  # fmt: skip
     assert answer.stdout.strip() == str(here)
+
+
+def test_evaluation_shows_the_share_of_the_optimum(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, sets: list[InstanceSet]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runs, "STOP", StopRequests())
+    few = tmp_path / "few.csv"
+    few.write_text(sets[1].subset(range(3)).to_csv())
+    quick = ["budget.steps=2048", "learner.n_epochs=1", "tracking.uri=null", "resources.workers=0"]
+    config = INSTANCES.parent / "maze_single.yaml"
+    for arguments in (
+        ["train", config, "--out", "run", *(part for setting in quick for part in ("--set", setting))],
+        ["evaluate", "run", "--instances", few, "--json", "--out", "results.csv"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
+        capsys.readouterr()
+        cli.main()
+    answer = json.loads(capsys.readouterr().out)
+    best = [1 - 0.004 * (len(search(layout)[4, 4]) - 1) for layout in sets[1].contexts[:3]]
+    assert answer["optimal_return"] == pytest.approx(np.mean(best))
+    rows = [line.split(",") for line in (tmp_path / "results.csv").read_text().splitlines()]
+    assert (rows[0][1], rows[0][-1]) == ("return", "optimal_return")
+    assert [float(row[-1]) for row in rows[1:]] == pytest.approx(best)
+    returns = [float(row[1]) for row in rows[1:]]
+    assert answer["share_of_optimum"] == pytest.approx(sum(returns) / sum(best))

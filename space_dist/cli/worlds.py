@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import typer
 
-from space_dist.cli.terminal import say
+from space_dist.cli.terminal import Kwargs, parse_kwargs, say
 from space_dist.errors import ConfigError
 
 env_app = typer.Typer(no_args_is_help=True, help="Check environments.")
-
-Kwargs = Annotated[
-    Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
-    typer.Option("--kwarg", metavar="NAME=VALUE", help="An argument of the environment (env.kwargs). Repeatable."),
-]
 
 
 @env_app.command("check")
@@ -42,22 +37,3 @@ def env_check(
     if findings.faults:
         raise ConfigError("\n".join(fault if env in fault else f"{env}: {fault}" for fault in findings.faults))
     say(f"{env}: no fault found. Context: {', '.join(findings.names)}. Horizon: {findings.horizon} steps")
-
-
-def parse_kwargs(given: list[str] | None) -> dict[str, Any]:
-    """`NAME=VALUE` as YAML reads the value. Raises ConfigError for anything else."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    kwargs: dict[str, Any] = {}
-    for one in given or []:
-        name, equals, value = one.partition("=")
-        if not equals or not name.isidentifier():
-            raise ConfigError(f"--kwarg {one!r} is not NAME=VALUE")
-        try:
-            kwargs[name] = YAML(typ="safe", pure=True).load(value)
-        except YAMLError:
-            kwargs[name] = None
-        if not isinstance(kwargs[name], bool | int | float | str):
-            raise ConfigError(f"--kwarg {one!r}: the value must be a number, a word, true or false")
-    return kwargs

@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from space_dist.envs.carl import CarlEnv, is_carl
 from space_dist.envs.cartpole import BatchedCartPole
@@ -20,7 +21,7 @@ from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError, nearest
-from space_dist.instances import ContextBounds
+from space_dist.instances import ContextBounds, Distribution
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
@@ -85,6 +86,29 @@ def takes_argument(env_id: str, name: str) -> bool:
         return name in inspect.signature(_find(env_id)).parameters
     except (TypeError, ValueError):  # written in C
         return False
+
+
+def distribution_of(env_id: str, kwargs: Mapping[str, Any] = MappingProxyType({})) -> Distribution:
+    """What an environment's contexts are drawn from where nothing else is known: uniform within the bounds.
+
+    The environment's own, if it draws its contexts. Whole numbers, if its contexts are such.
+    """
+    env = make_batched(env_id, 1, context_visible=False, kwargs=kwargs)
+    bounds = env.context_bounds
+    if isinstance(env, DrawsContexts):
+        return Distribution(f"{env_id}, its own", "the environment", bounds, env.draw_contexts)
+    if isinstance(env, BatchedSingles) and env.whole_contexts:
+        return Distribution(
+            f"{env_id}, whole numbers, uniform within the bounds", "the environment (the bounds)", bounds,
+            lambda rng, n: rng.integers(
+                np.ceil(bounds.low).astype(int), np.floor(bounds.high).astype(int), size=(n, len(bounds.low)),
+                endpoint=True,
+            ).astype(np.float64),
+        )  # fmt: skip
+    return Distribution(
+        f"{env_id}, uniform within the bounds", "the environment (the bounds)", bounds,
+        lambda rng, n: rng.uniform(bounds.low, bounds.high, size=(n, len(bounds.low))),
+    )  # fmt: skip
 
 
 def _takes_slots(make: Callable[..., Any], kwargs: Mapping[str, Any]) -> bool:
@@ -174,6 +198,7 @@ __all__ = [
     "Observations",
     "SingleEnv",
     "Step",
+    "distribution_of",
     "make_batched",
     "takes_argument",
     "unwrapped",

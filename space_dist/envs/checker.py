@@ -21,7 +21,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, make_batched
+from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, distribution_of, make_batched
 from space_dist.envs.interface import FloatArray, Step
 from space_dist.envs.observations import Observations
 from space_dist.errors import ConfigError, SpaceDistError
@@ -87,7 +87,7 @@ class _Check:
         self._bounds = env.context_bounds
         findings.names = self._bounds.names
         self._drawn = instances is None and not isinstance(env, DrawsContexts)  # uniformly: features vary one by one
-        self._contexts = self._draw(env) if instances is None else _cycled(instances.contexts, N_CONTEXTS)
+        self._contexts = self._draw() if instances is None else _cycled(instances.contexts, N_CONTEXTS)
         self._seeds = episode_seeds(0, Purpose.EPISODES, count=N_CONTEXTS)
         self._actions = _sampled_actions(env.action_space, N_CONTEXTS + 1, max(self._horizon, COMPARED_STEPS))
 
@@ -326,15 +326,10 @@ class _Check:
         more = f" (or one of the {len(contexts) - 1} others)" if len(contexts) > 1 else ""
         return f"the context {shown[:200]}{more}"
 
-    def _draw(self, env: BatchedEnv) -> FloatArray:
-        rng = generator(0, Purpose.INSTANCES)
-        if isinstance(env, DrawsContexts):
-            return env.draw_contexts(rng, N_CONTEXTS)
-        low, high = self._bounds.low, self._bounds.high
-        drawn = rng.uniform(low, high, size=(N_CONTEXTS, len(low)))
-        if isinstance(env, BatchedSingles) and env.whole_contexts:
-            drawn = np.floor(drawn)
-        drawn[-2:] = low, high
+    def _draw(self) -> FloatArray:
+        drawn = distribution_of(self._env_id, self._kwargs).draw(generator(0, Purpose.INSTANCES), N_CONTEXTS)
+        if self._drawn:
+            drawn[-2:] = self._bounds.low, self._bounds.high
         return drawn
 
     # ---- what came back ----
