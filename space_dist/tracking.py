@@ -16,6 +16,8 @@ import logging
 import os
 import re
 import sqlite3
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,6 +44,7 @@ ARTIFACTS_TAG: Final = "space_dist.artifacts"
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
 _MAX_PARAM, _MAX_TAG, _MAX_KEY = 6000, 5000, 250  # characters
 _DATABASE_WAIT_SECONDS: Final = 20.0
+_DRAW_SECONDS: Final = 60.0  # for the pictures of a run
 _ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
 # MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
 _ENVIRONMENT: Final = {
@@ -463,7 +466,30 @@ def _draw(ledger: Ledger, folder: Path) -> list[Path]:
         figures["curriculum.png"] = draw_curriculum(run)
     for name, figure in figures.items():
         save(figure, folder / name)
-    return [folder / name for name in figures]
+    return [folder / name for name in figures] + _draw_episodes(ledger, folder / "episodes")
+
+
+def _draw_episodes(ledger: Ledger, folder: Path) -> list[Path]:
+    """What the policy does, in GIFs and PNGs, for our own environments and policies that act without torch.
+
+    In a process of its own, which can be ended when it takes too long; a failure costs a warning.
+    """
+    try:
+        env_id = str(_config(ledger)["env"]["id"])
+        policy = json.loads(ledger.model_description.read_bytes())["policy"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []  # nothing that acts
+    if policy == "torch" or not env_id.startswith("space_dist/"):
+        return []
+    command = [sys.executable, "-m", "space_dist.cli", "render", "--out", str(folder), "--", str(ledger.folder)]
+    try:
+        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_DRAW_SECONDS, check=True)
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip()
+        log.warning("%s: its episodes were not drawn: %s", ledger.folder, said[:300])
+    except (subprocess.TimeoutExpired, OSError) as error:
+        log.warning("%s: its episodes were not drawn: %s", ledger.folder, error)
+    return sorted(folder.glob("*")) if folder.is_dir() else []
 
 
 def _whole_number(text: str) -> int:

@@ -257,7 +257,8 @@ def test_evaluation_shows_the_share_of_the_optimum(
     ):
         monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
         capsys.readouterr()
-        cli.main()
+        with pytest.raises(SystemExit, match=r"^0$"):
+            cli.main()
     answer = json.loads(capsys.readouterr().out)
     best = [1 - 0.004 * (len(search(layout)[4, 4]) - 1) for layout in sets[1].contexts[:3]]
     assert answer["optimal_return"] == pytest.approx(np.mean(best))

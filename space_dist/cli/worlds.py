@@ -37,3 +37,25 @@ def env_check(
     if findings.faults:
         raise ConfigError("\n".join(fault if env in fault else f"{env}: {fault}" for fault in findings.faults))
     say(f"{env}: no fault found. Context: {', '.join(findings.names)}. Horizon: {findings.horizon} steps")
+
+
+def render(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    instances: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Ids of training or test instances: 0,5,9. Default: three of the test set."),
+    ] = None,
+) -> None:
+    """Draw what a run's policy does: a GIF for each instance, and trajectories side by side."""
+    from space_dist.ledger import Ledger
+    from space_dist.render import draw_run
+
+    ids = None
+    if instances is not None:
+        try:
+            ids = [int(one) for one in instances.split(",")]
+        except ValueError:
+            raise ConfigError(f"--instances {instances!r} must be ids, separated by commas: 0,5,9") from None
+    for path, what in draw_run(Ledger(run), out, ids):
+        say(f"{path}: {what}")
