@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import warnings
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -174,7 +175,10 @@ def _find(env_id: str) -> Callable[..., Any]:
             "an id registered with Gymnasium, or an import path like my_package.my_module:make"
         )
     try:
-        found = getattr(importlib.import_module(module_name), name, None)
+        with warnings.catch_warnings():
+            if module_name.partition(".")[0] == "carl":  # warns of each of its suites that is not installed
+                warnings.simplefilter("ignore")
+            found = getattr(importlib.import_module(module_name), name, None)
     except (Exception, SystemExit) as error:  # somebody else's module may raise anything
         what = f"{type(error).__name__}: {str(error)[:200]}"
         raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {what}") from error

@@ -35,11 +35,14 @@ class CarlEnv(gym.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, carl_class: type[Any], *, features: str = "", **kwargs: Any) -> None:
-        env = carl_class(**kwargs)
+        with np.errstate(invalid="ignore"):  # ConfigSpace divides infinite bounds
+            env = carl_class(**kwargs)
+            space = env.get_context_space()
         super().__init__(env)
         self._carl = env
         self.observation_space = env.base_observation_space
-        bounds = _parse(features, env.get_context_space())
+        self._defaults = space.get_default_context()
+        bounds = _parse(features, space)
         self.context_names = tuple(bounds)
         low, high = np.array(list(bounds.values())).T
         self.context_space = spaces.Box(low, high, dtype=np.float64)
@@ -51,11 +54,10 @@ class CarlEnv(gym.Wrapper[Any, Any, Any, Any]):
 
         if options is not None and "context" in options:
             self._context = dict(zip(self.context_names, np.asarray(options["context"]).tolist(), strict=True))
-        context = self._carl.get_context_space().insert_defaults(self._context)
         # A new selector has chosen nothing yet, so that CARL takes this choice for a change and applies it.
-        self._carl.contexts = {0: context}
-        self._carl.context_selector = RoundRobinSelector(contexts={0: context})
-        observation, info = self._carl.reset(seed=seed)
+        self._carl.context_selector = RoundRobinSelector(contexts={0: {**self._defaults, **self._context}})
+        with np.errstate(invalid="ignore"):
+            observation, info = self._carl.reset(seed=seed)
         return observation["obs"], info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
