@@ -20,7 +20,7 @@ class Honest(gym.Env[Any, Any]):
 
     context_space: Any = spaces.Box(np.array([0.1, -0.5]), np.array([0.5, 0.5]), dtype=np.float64)
     context_names: Any = ("gain", "drift")
-    observation_space = spaces.Box(-10.0, 10.0, shape=(1,), dtype=np.float32)
+    observation_space: Any = spaces.Box(-10.0, 10.0, shape=(1,), dtype=np.float32)
     action_space: Any = spaces.Discrete(3)
     horizon: Any = HORIZON
 
@@ -207,6 +207,17 @@ class ChangesActions(Honest):
         return moved
 
 
+class NumberObserved(Honest):
+    observation_space: Any = spaces.Discrete(5)
+
+
+class OnePartOnly(Honest):
+    observation_space: Any = spaces.Dict({"place": Honest.observation_space, "clock": Honest.observation_space})
+
+    def observe(self) -> Any:
+        return {"place": super().observe()}
+
+
 class NoContextSpace(Honest):
     context_space = property()
 
@@ -236,6 +247,21 @@ class Whole(Honest):
     def move(self, action: Any) -> float:
         assert self.context.dtype == np.int64
         return 0.1 * float(self.context[0]) * (action - 1)
+
+
+class Parts(Honest):
+    """Without fault: a dictionary is observed, and actions are continuous."""
+
+    observation_space: Any = spaces.Dict(
+        {"place": Honest.observation_space, "clock": spaces.Box(0, HORIZON, shape=(), dtype=np.int64)}
+    )
+    action_space = spaces.Box(0.0, 2.0, shape=(1,), dtype=np.float32)
+
+    def move(self, action: Any) -> float:
+        return super().move(float(action[0]))
+
+    def observe(self) -> Any:
+        return {"place": super().observe(), "clock": np.array(self.time)}
 
 
 class HalfUsed(Honest):

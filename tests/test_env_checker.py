@@ -38,6 +38,8 @@ FAULTS = {
     "FailsAtTheEdge": "reset() with the context gain .* fails: KeyError: 'no such gain'",
     "FailsInStep": "step() fails: ZeroDivisionError",
     "ChangesActions": "step() changes the action it is given",
+    "NumberObserved": "its observation_space must be a Box or a Dict of Boxes, not Discrete(5)",
+    "OnePartOnly": "the observation at reset has the parts place, its space has clock, place",
     "NoContextSpace": "has no `context_space`",
     "EndlessBounds": "its context_space cannot be used: feature 'gain' has bounds [-inf, inf]",
     "NamesTwice": "the feature 'gain' is named twice",
@@ -79,7 +81,7 @@ def test_a_batched_environments_fault_is_named(kind: str) -> None:
     assert said(fault, BATCHED_FAULTS[kind]), fault
 
 
-@pytest.mark.parametrize("kind", ["Honest", "Whole", "HalfUsed"])
+@pytest.mark.parametrize("kind", ["Honest", "Whole", "Parts", "HalfUsed"])
 def test_without_fault(kind: str) -> None:
     findings = check(f"tests.faulty_env:{kind}")
     assert findings.faults == []
