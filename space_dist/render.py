@@ -82,6 +82,7 @@ class Scene(Protocol):
 
     milliseconds: int  # a step lasts in a GIF
     height: float  # of a GIF's picture, in inches, where it is 4 wide
+    whole: bool  # whether one picture tells a whole episode
 
     def prepare(self, axes: Axes, context: NDArray[np.float64]) -> Callable[[NDArray[Any]], Sequence[Artist]]:
         """Draw what stands still; returns what draws an episode so far, `(steps + 1, ...)`, and says what moves."""
@@ -136,25 +137,26 @@ class Gallery:
 
     def gif(self, split: Split, place: int, folder: Path) -> tuple[Path, Episode]:
         """Write `<split>_<id>.gif`. Raises ConfigError if the environment cannot be drawn."""
-        frames: list[Frame] = []
+        frames: dict[int, Frame] = {}
         if self._scene is None:
             if not isinstance(unwrapped(self._env), Drawable):
                 raise ConfigError(f"{self._config.env.id} cannot be drawn: it has no frame(slot)")
-            episode = self._play(split, place, frames)
-            pictures = [_labelled(frame, episode, index) for index, frame in enumerate(frames)]
+            every = _stride(self._env.horizon + 1)
+            episode = self._play(split, place, frames, every)
+            pictures = [_labelled(frame, episode, step) for step, frame in frames.items()]
             milliseconds = 50
         else:
             episode = self._play(split, place)
-            pictures = _animation(self._scene, episode)
+            every = _stride(len(episode.observations))
+            pictures = _animation(self._scene, episode, every)
             milliseconds = self._scene.milliseconds
         path = folder / f"{split}_{episode.id}.gif"
-        every = _stride(len(pictures))
-        _write_gif(path, [*pictures[:-1:every], pictures[-1]], every * milliseconds)
+        _write_gif(path, pictures, every * milliseconds)
         return path, episode
 
     def trajectories(self, split: Split, folder: Path) -> list[Path]:
-        """Write `trajectories_<split>.png`: small multiples over the contexts, for PointMass and Maze alone."""
-        if self._scene is None or isinstance(self._scene, _CartPole):
+        """Write `trajectories_<split>.png`, small multiples over the contexts, where one picture tells an episode."""
+        if self._scene is None or not self._scene.whole:
             return []
         scene = self._scene
         instances = self._sets[split]
@@ -185,16 +187,18 @@ class Gallery:
         picture = {"render_mode": "rgb_array"} if takes_argument(env.id, "render_mode") else {}
         return make_batched(env.id, 1, context_visible=env.context_visible, kwargs={**env.kwargs, **picture})
 
-    def _play(self, split: Split, place: int, frames: list[Frame] | None = None) -> Episode:
-        """One deterministic episode; if asked for, with a picture before it and behind every step."""
+    def _play(
+        self, split: Split, place: int, frames: dict[int, Frame] | None = None, every: int = 1
+    ) -> Episode:  # fmt: skip
+        """One deterministic episode; `frames` takes pictures of its start, of every so many steps and of its end."""
         env, world, instances = self._env, unwrapped(self._env), self._sets[split]
         context = instances.contexts[place : place + 1]
         n_features = context.shape[1] if self._config.env.context_visible else 0
 
-        def look() -> None:
+        def look(over: bool) -> None:
+            if frames is not None and isinstance(world, Drawable) and (over or len(seen) % every == 0):
+                frames[len(seen)] = world.frame(0)
             seen.append(np.array(observations[0, : observations.shape[1] - n_features]) if flat else np.zeros(0))
-            if frames is not None and isinstance(world, Drawable):
-                frames.append(world.frame(0))
 
         observations: Any = take(
             env.reset(np.array([0]), context, self._seeds[split][place : place + 1]), slice(None)
@@ -202,15 +206,16 @@ class Gallery:
         flat = isinstance(observations, np.ndarray) and observations.ndim == 2
         seen: list[NDArray[Any]] = []
         total, success = 0.0, None
-        look()
+        look(over=False)
         for _ in range(env.horizon):
             head = self._policy.head
             step = env.step(head.executed(head.best(self._policy.outputs(observations))))
             observations = take(step.observations, slice(None))
             total += float(step.rewards[0])
             success = None if step.success is None else bool(step.success[0])
-            look()
-            if step.terminated[0] or step.truncated[0]:
+            over = bool(step.terminated[0] or step.truncated[0])
+            look(over)
+            if over:
                 break
         optimum = float(world.optimal_returns(context)[0]) if isinstance(world, KnowsOptimum) else None
         return Episode(split, int(instances.ids[place]), context[0], np.array(seen), total, success, optimum)
@@ -241,7 +246,7 @@ def draw_run(ledger: Ledger, folder: Path, ids: Sequence[int] | None = None) -> 
 
 
 class _PointMass:
-    milliseconds, height = 100, 4.4  # real time
+    milliseconds, height, whole = 100, 4.4, True  # real time
 
     def prepare(self, axes: Axes, context: NDArray[np.float64]) -> Callable[[NDArray[Any]], Sequence[Artist]]:
         gate_x, gate_width, _ = context
@@ -282,7 +287,7 @@ class _PointMass:
 
 
 class _CartPole:
-    milliseconds, height = 20, 2.6  # real time
+    milliseconds, height, whole = 20, 2.6, False  # real time
 
     def prepare(self, axes: Axes, context: NDArray[np.float64]) -> Callable[[NDArray[Any]], Sequence[Artist]]:
         pole = 2.0 * float(context[0])  # the context is half its length
@@ -320,7 +325,7 @@ _SIDES: Final = np.array(  # of a cell around (0, 0), by action: from where to w
 
 
 class _Maze:
-    milliseconds, height = 250, 4.4
+    milliseconds, height, whole = 250, 4.4, True
 
     def prepare(self, axes: Axes, context: NDArray[np.float64]) -> Callable[[NDArray[Any]], Sequence[Artist]]:
         _bare(axes, (-0.6, SIDE - 0.4), (SIDE - 0.4, -0.6), framed=False)  # y points down
@@ -370,8 +375,8 @@ def _bare(axes: Axes, x: tuple[float, float], y: tuple[float, float], *, framed:
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
 
-def _animation(scene: Scene, episode: Episode) -> list[Image.Image]:
-    """A picture before the first step and behind each. What stands still is drawn once."""
+def _animation(scene: Scene, episode: Episode, every: int) -> list[Image.Image]:
+    """Pictures of the start, of every so many steps and of the end. What stands still is drawn once."""
     figure = Figure(figsize=(4.0, scene.height), layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -385,11 +390,7 @@ def _animation(scene: Scene, episode: Episode) -> list[Image.Image]:
     canvas.draw()  # type: ignore[no-untyped-call]
     background = canvas.copy_from_bbox(figure.bbox)  # type: ignore[no-untyped-call]
     pictures: list[Image.Image] = []
-    shown = set(range(0, episode.length, _stride(episode.length + 1))) | {episode.length}
-    for step in range(episode.length + 1):
-        if step not in shown:
-            pictures.append(pictures[-1])
-            continue
+    for step in sorted({*range(0, episode.length, every), episode.length}):
         show(episode.observations[: step + 1])
         over = step == episode.length
         line.set_text(f"step {step}: {episode.outcome}" if over else f"step {step}")

@@ -489,7 +489,7 @@ def _draw_episodes(ledger: Ledger, folder: Path) -> list[Path]:
         log.warning("%s: its episodes were not drawn: %s", ledger.folder, said[:300])
     except (subprocess.TimeoutExpired, OSError) as error:
         log.warning("%s: its episodes were not drawn: %s", ledger.folder, error)
-    return sorted(folder.glob("*")) if folder.is_dir() else []
+    return sorted([*folder.glob("*.gif"), *folder.glob("*.png")])  # whole ones, also of a process that was ended
 
 
 def _whole_number(text: str) -> int:

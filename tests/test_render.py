@@ -14,7 +14,7 @@ from mlflow import MlflowClient
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from space_dist import cli
+from space_dist import cli, tracking
 from space_dist import config as configs
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
@@ -209,6 +209,7 @@ def test_a_finished_runs_episodes_are_mirrored_and_a_failure_costs_a_warning(
 ) -> None:
     """The rows of a finished run, with the config, the sets and the policy of the corridor's."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tracking, "_DRAW_SECONDS", 250.0)  # however slow the machine is
     uri = f"sqlite:///{tmp_path / 'store' / 'mlflow.db'}"
     ledgers = [finished_run(tmp_path / f"run{number}", 1.0, seed=number) for number in range(2)]
     for ledger in ledgers:
