@@ -44,8 +44,8 @@ class EnvConfig(Section):
     """The environment."""
 
     id: str = Field(min_length=1, max_length=300)
-    """Registered id (space_dist/PointMass-v0) or import path of a function that makes a batched environment
-    (my_package.my_module:make)."""
+    """Registered id (space_dist/PointMass-v0) or import path (my_package.my_module:make): of a Gymnasium environment
+    with a context_space, of a function that makes one or a batched environment, or of a class of CARL's."""
     kwargs: dict[str, bool | int | float | str] = {}
     """Arguments of the environment, by name. What they mean, and their units, is the environment's."""
     context_visible: bool = True

@@ -244,12 +244,12 @@ def test_the_picture_shows_the_scene_and_changes_nothing(env_id: str) -> None:
     for one in (env, unseen):
         one.reset(np.arange(2), contexts, np.arange(2, dtype=np.uint64))
         one.step(actions)
-    picture = env.render(1, width=64, height=48)
-    assert (picture.shape, picture.dtype) == ((48, 64, 3), np.uint8)
+    picture = env.frame(1)
+    assert (picture.shape, picture.dtype) == ((240, 320, 3), np.uint8)
     assert picture.std() > 10
     for _ in range(10):
         np.testing.assert_array_equal(env.step(actions).observations, unseen.step(actions).observations)
-    assert (env.render(1, width=64, height=48) != picture).any()
+    assert (env.frame(1) != picture).any()
 
 
 @pytest.mark.parametrize("distribution", ["antgoal_positive", "antgoal_all", "ballcatching_uniform"])

@@ -50,6 +50,8 @@ def rows() -> list[Row]:
             "plain NumPy, one at a time", plain(PlainPointMass(), "pointmass_uniform", 2_000), 50.0),
         Row("CartPole, 256 slots", batched("space_dist/CartPole-v0", "cartpole_uniform", 256, 500),
             "itself, 1 slot", batched("space_dist/CartPole-v0", "cartpole_uniform", 1, 2_000), 20.0),
+        Row("Maze, 256 slots", batched("space_dist/Maze-v0", "maze_dfs", 256, 500),
+            "itself, 1 slot", batched("space_dist/Maze-v0", "maze_dfs", 1, 2_000), 20.0),
         Row("AntGoal, 1 slot", batched("space_dist/AntGoal-v0", "antgoal_all", 1, 2_000),
             "pybullet_envs_gymnasium's Ant", bullet_ant(2_000), 0.95),
         Row("BallCatching, 1 slot", batched("space_dist/BallCatching-v0", "ballcatching_uniform", 1, 2_000),

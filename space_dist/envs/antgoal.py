@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from space_dist.envs.bullet import BatchedBullet, Camera, World
 from space_dist.envs.interface import FloatArray
-from space_dist.instances import ANTGOAL_BOUNDS
+from space_dist.instances import ANTGOAL_BOUNDS, DISTRIBUTIONS
 
 HORIZON: Final = 500
 """The paper's figure; the released code has 500 for SPaCE and round robin, and 150 elsewhere."""
@@ -175,3 +175,7 @@ class BatchedAntGoal(BatchedBullet[AntEpisode]):
         self.context_bounds = ANTGOAL_BOUNDS
         self.knows_success = False
         super().__init__(n_slots, horizon, AntWorld)
+
+    def draw_contexts(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """`(n, 3)` goals in all four quadrants, and legs, which are whole numbers."""
+        return DISTRIBUTIONS["antgoal_all"].draw(rng, n)

@@ -19,7 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -148,6 +148,9 @@ class World(ABC, Generic[Episode]):
         self._disconnect()
 
 
+PICTURE: Final = (320, 240)  # pixels
+
+
 class BatchedBullet(Generic[Episode]):
     """`n_slots` episodes in PyBullet worlds made by `make_world`. Subclasses name spaces, bounds and horizon."""
 
@@ -201,9 +204,9 @@ class BatchedBullet(Generic[Episode]):
         truncated = (self._time >= self.horizon) & ~terminated
         return Step(observations, rewards, terminated, truncated, success if self.knows_success else None)
 
-    def render(self, slot: int = 0, *, width: int = 320, height: int = 240) -> NDArray[np.uint8]:
-        """`(height, width, 3)` what a slot's world looks like now, drawn by PyBullet's software renderer."""
-        return self._at_home(slot).draw(width, height)
+    def frame(self, slot: int) -> NDArray[np.uint8]:
+        """`(240, 320, 3)` what a slot's world looks like now, drawn by PyBullet's software renderer."""
+        return self._at_home(slot).draw(*PICTURE)
 
     def close(self) -> None:
         """Disconnect all worlds. Happens by itself when nobody holds the environment any more."""
