@@ -71,7 +71,9 @@ class Run:
     def set_size(self) -> tuple[IntArray, IntArray]:
         """`(m,)` real steps at which each iteration began, and `(m,)` the size of the set it was trained on."""
         starts = np.concatenate((np.zeros(1, dtype=np.int64), self.iteration_ends))[:-1]
-        return starts, np.array([len(ids) for ids in self.trained], dtype=np.int64)
+        return starts, np.array(
+            [len(ids if (ids < 0).any() else np.unique(ids)) for ids in self.trained], dtype=np.int64
+        )
 
     @functools.cached_property
     def all_instances_reached_at(self) -> int | None:
