@@ -459,7 +459,7 @@ def _draw(ledger: Ledger, folder: Path) -> list[Path]:
     figures = {}
     if len(run.evaluation_steps):
         figures["learning_curve.png"] = draw_learning_curve(run)
-    if run.trained and not run.generates_contexts:
+    if run.trained:
         figures["curriculum.png"] = draw_curriculum(run)
     for name, figure in figures.items():
         save(figure, folder / name)

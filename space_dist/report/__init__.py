@@ -8,7 +8,7 @@ from pathlib import Path
 
 from space_dist.errors import ConfigError
 from space_dist.ledger import Ledger, atomic_write
-from space_dist.report.figures import draw_comparison, draw_curriculum, draw_learning_curve, save
+from space_dist.report.figures import draw_comparison, draw_contexts, draw_curriculum, draw_learning_curve, save
 from space_dist.report.load import Configuration, Run, group, load_run, read_config
 from space_dist.report.statistics import RESAMPLES, Estimate, bootstrap_interval, estimate, interquartile_mean
 from space_dist.report.tables import Summary, cells, remarks, summarise, to_csv, to_markdown
@@ -22,6 +22,7 @@ __all__ = [
     "bootstrap_interval",
     "build_report",
     "draw_comparison",
+    "draw_contexts",
     "draw_curriculum",
     "draw_learning_curve",
     "estimate",

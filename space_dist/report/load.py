@@ -33,7 +33,9 @@ class Run:
     `instance_ids` `(n,)` are the training instances, ascending. `evaluation_steps` `(k,)` are real environment steps;
     `train` and `test` map each of MEASURES to `(k,)` means over the split's instances in the environment's units, NaN
     where there is no such number. `iteration_ends` `(m,)` are real environment steps, `trained` the m arrays of ids
-    that were trained on, in order.
+    that were trained on, in order. `contexts` are the `(k, d)` contexts of each iteration whose contexts were
+    generated, in environment units, of `features`. `decisions` are the steps of the complete iterations and what the
+    curriculum logged at their end.
     """
 
     ledger: Ledger
@@ -45,6 +47,9 @@ class Run:
     test: Mapping[str, FloatArray]
     iteration_ends: IntArray
     trained: tuple[IntArray, ...]
+    features: tuple[str, ...] = ()
+    contexts: tuple[FloatArray, ...] = ()
+    decisions: tuple[tuple[int, Mapping[str, Any]], ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -149,7 +154,8 @@ def load_run(ledger: Ledger) -> Run:
     """
     status = ledger.status()  # before the rows: a run that is done now has all of them
     config, instance_ids = read_config(ledger), _instance_ids(ledger)
-    evaluations = [row for row in _rows(ledger, METRICS) if row.get("kind") == "evaluation"]
+    metrics = _rows(ledger, METRICS)
+    evaluations = [row for row in metrics if row.get("kind") == "evaluation"]
     iterations = _rows(ledger, CURRICULUM)
     try:
         steps = np.array([int(row["steps"]) for row in evaluations], dtype=np.int64)
@@ -157,9 +163,15 @@ def load_run(ledger: Ledger) -> Run:
                        for split in ("train", "test"))  # fmt: skip
         ends = np.array([int(row["steps"]) for row in iterations], dtype=np.int64)
         trained = tuple(np.array(row["trained"], dtype=np.int64) for row in iterations)
+        contexts = tuple(np.array(row["contexts"], dtype=np.float64) for row in iterations if "contexts" in row)
+        decisions = tuple((int(row["steps"]), dict(row["curriculum"])) for row in metrics
+                          if row.get("kind") == "iteration" and row["curriculum"])  # fmt: skip
+        features = tuple(name for name in _header(ledger) if name != "id")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise LedgerError(f"{ledger.folder} has rows that this version cannot read: {error!r}") from None
-    return Run(ledger, config, status, instance_ids, steps, train, test, ends, trained)
+    return Run(
+        ledger, config, status, instance_ids, steps, train, test, ends, trained, features, contexts, decisions
+    )  # fmt: skip
 
 
 def group(runs: Sequence[Run]) -> list[Configuration]:
@@ -208,6 +220,11 @@ def _instance_ids(ledger: Ledger) -> IntArray:
     except (ValueError, IndexError):
         raise LedgerError(f"{ledger.instances('train')} is damaged: not every row has an id") from None
     return np.array(ids, dtype=np.int64)
+
+
+def _header(ledger: Ledger) -> list[str]:
+    """The columns of the training instances."""
+    return [name.strip() for name in _read_instances(ledger, "train").partition("\n")[0].split(",")]
 
 
 def _rows(ledger: Ledger, name: str) -> list[Row]:
