@@ -98,12 +98,12 @@ class Central:
     """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state."""
 
     def __init__(self, config: RunConfig, train: InstanceSet) -> None:
-        self._curriculum = make_curriculum(config, train)
+        self.curriculum = make_curriculum(config, train)
         self._from_zero = isinstance(config.curriculum, GrowingConfig) and config.curriculum.v0 == "zero"
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
         """The first decision and V_0."""
-        state, selection = self._curriculum.start()
+        state, selection = self.curriculum.start()
         values = checked(np.concatenate(chunks), "start values")
         return state, selection, {}, np.zeros_like(values) if self._from_zero else values
 
@@ -127,7 +127,7 @@ class Central:
             version, before, after, gradient_steps, members=members,
             episodes=next(self._valued(seen, after), None), probes=self._probed(version, seen.get("probes", [])),
         )  # fmt: skip
-        new, selection, numbers = self._curriculum.step(state, feedback)
+        new, selection, numbers = self.curriculum.step(state, feedback)
         return new, selection, numbers, after
 
     def _valued(self, seen: Mapping[str, list[Any]], after: FloatArray) -> Iterator[Episodes]:
@@ -139,7 +139,7 @@ class Central:
     def _probed(self, version: int, parts: list[Outcomes]) -> Probes | None:
         if not parts:
             return None
-        indices = self._curriculum.probes(version)
+        indices = self.curriculum.probes(version)
         if indices is None:
             raise RuntimeError(f"selection {version} was probed, and nobody asked for that")
         outcomes = joined(parts)

@@ -134,6 +134,12 @@ class SpaceConfig(GrowingConfig):
         """See `_Curriculum`."""
         return self.pic != "random" and not self.allow_context_blind
 
+    @model_validator(mode="after")
+    def _something_to_reverse(self) -> Self:
+        if self.reverse and self.pic == "random":
+            raise ValueError("reverse: true changes nothing with pic: random")
+        return self
+
 
 class RandomGrowthConfig(GrowingConfig):
     """Control: grows exactly like SPaCE, but which instances are in the set is random."""

@@ -17,11 +17,12 @@ function of (config, seed).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -114,33 +115,40 @@ def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
             f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
             f"compute. Allowed learners: {', '.join(ON_POLICY)}"
         )
-    if config.curriculum.probes and not _knows_success(config):
+    if config.curriculum.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
         raise ConfigError(
             f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
             "not say (its steps have no `success`)"
         )
 
 
-def _knows_success(config: RunConfig) -> bool:
-    """Whether a first step reports success, true or not."""
-    env = make_env(config)
-    bounds = env.context_bounds
-    env.action_space.seed(0)
-    env.reset(np.zeros(1, dtype=np.int64), (bounds.low + bounds.high)[None] / 2.0, np.zeros(1, dtype=np.uint64))
-    return env.step(np.asarray(env.action_space.sample())[None]).success is not None
+def _knows_success(config: RunConfig, contexts: NDArray[np.float64]) -> bool:
+    """Whether a first step in a (1, d) context reports success, true or not."""
+    with _failures_explained(config, "reset or a first step"):
+        env = make_env(config)
+        env.action_space.seed(0)
+        env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
+        return env.step(np.asarray(env.action_space.sample())[None]).success is not None
 
 
 def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
     """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
     slots = min(len(train), _COMPARED_STARTS)
-    seeds = np.zeros(slots, dtype=np.uint64)
+    with _failures_explained(config, "reset"):
+        env = make_env(config, slots)
+        starts = env.reset(np.arange(slots), train.contexts[:slots], np.zeros(slots, dtype=np.uint64))
+    return slots > 1 and alike(starts)
+
+
+@contextlib.contextmanager
+def _failures_explained(config: RunConfig, what: str) -> Iterator[None]:
+    """Somebody else's environment may raise anything."""
     try:
-        starts = make_env(config, slots).reset(np.arange(slots), train.contexts[:slots], seeds)
+        yield
     except ConfigError:
         raise
-    except Exception as error:  # somebody else's code may raise anything
-        raise ConfigError(f"env.id {config.env.id!r}: reset failed: {type(error).__name__}: {error}") from error
-    return slots > 1 and alike(starts)
+    except Exception as error:
+        raise ConfigError(f"env.id {config.env.id!r}: {what} failed: {type(error).__name__}: {error}") from error
 
 
 @dataclass
@@ -210,7 +218,7 @@ class Training:
         self._horizon = make_env(config).horizon
         self._total_steps = total_steps(config, self._horizon)
         self.learner = learner_of(config)
-        self._ensemble = ensemble_of(config)
+        self.ensemble = ensemble_of(config)
         self._curriculum = make_curriculum(config, setup.train)
         self._run = _Run()
         self._last_row_time = self._last_commit_time = time.monotonic()
@@ -272,9 +280,9 @@ class Training:
         """Learn from a round; `steps`: of the run, with these shards."""
         scales = self.learner.statistics  # the ones that the round was collected under
         update = self.learner.update(shards, round=self._run.round, steps=steps)
-        if self._ensemble is None:
+        if self.ensemble is None:
             return update
-        metrics = self._ensemble.update(shards, scales, round=self._run.round)
+        metrics = self.ensemble.update(shards, scales, round=self._run.round)
         return dataclasses.replace(update, metrics={**update.metrics, **metrics})
 
     def _decide(self, policy: Handle) -> None:
@@ -317,10 +325,10 @@ class Training:
         rescored, members, episodes, context_values = [], [], [], []
         if self.learner.normalises:  # both values at one scale: else a change of scale would look like progress
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
-        if self._ensemble is not None:
-            members = cluster.start_values(cluster.put(self._ensemble.policy(self.learner.statistics)))
+        if self.ensemble is not None:
+            members = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
         if wants.episodes:
-            seen = joined_episodes(run.seen)
+            seen = _joined_episodes(run.seen)
             episodes = [cluster.put(seen)]
             if (seen.indices == GENERATED).any():
                 context_values = cluster.context_values(policy, seen.contexts, version=run.version)
@@ -438,7 +446,7 @@ class Training:
             raise RuntimeError("an iteration ended before its selection was known")
         trained: Row = {"trained": run.trained.ids.tolist()}
         if run.trained.drawn:  # the draws that became episodes
-            seen = joined_episodes(run.seen)
+            seen = _joined_episodes(run.seen)
             generated = seen.indices == GENERATED
             trained = {"trained": np.where(generated, GENERATED, self._setup.train.ids[seen.indices]).tolist()}
             trained |= {"contexts": seen.contexts.tolist()} if generated.any() else {}
@@ -514,9 +522,9 @@ class Training:
         arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
         arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
         if run.seen:
-            arrays |= {f"seen/{name}": array for name, array in vars(joined_episodes(run.seen)).items()}
-        if self._ensemble is not None:
-            arrays |= {f"ensemble/{name}": array for name, array in self._ensemble.save().items()}
+            arrays |= {f"seen/{name}": array for name, array in vars(_joined_episodes(run.seen)).items()}
+        if self.ensemble is not None:
+            arrays |= {f"ensemble/{name}": array for name, array in self.ensemble.save().items()}
         self._store_transitions()
         data = {
             "learner": learner,
@@ -567,8 +575,8 @@ class Training:
         run.scored = _under("scored/", arrays)
         seen = _under("seen/", arrays)
         run.seen = [Episodes(**seen)] if seen else []
-        if self._ensemble is not None:
-            self._ensemble.load(_under("ensemble/", arrays))
+        if self.ensemble is not None:
+            self.ensemble.load(_under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
         return cluster.put(self.learner.policy(run.round))
 
@@ -664,7 +672,7 @@ def _episodes(
     )  # fmt: skip
 
 
-def joined_episodes(parts: Sequence[Episodes]) -> Episodes:
+def _joined_episodes(parts: Sequence[Episodes]) -> Episodes:
     """The episodes of all rounds of an iteration, in order."""
     names = [field.name for field in dataclasses.fields(Episodes)]
     return Episodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -658,6 +658,7 @@ def test_the_moments_of_the_set_are_the_target() -> None:
         ("{kind: spdrl, initial_std: [0]}", "initial_std"),
         ("{kind: plr, temperature: 0}", "temperature"),
         ("{kind: manual}", "curriculum.column: this key is required"),
+        ("{kind: space, pic: random, reverse: true}", "reverse: true changes nothing with pic: random"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(curriculum: str, words: str) -> None:

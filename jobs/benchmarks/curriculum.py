@@ -37,7 +37,7 @@ def curriculum(
     threadpool_limits(limits=1)
     private_ray()
     base = configs.load(ROOT / "configs/pointmass_space.yaml", ["tracking.uri=null"])
-    update = _ppo_update_seconds(base, repeats)
+    update = ppo_update_seconds(base, repeats)
     console.print(f"one stock PPO update (2,048 steps, minibatch 64, 10 epochs): {update:.3f} s of CPU time")
     table = Table(title="SPaCE's own cost per iteration (median CPU time, one thread)")
     for column in ("instances", "revalue", "select", "both", "share of an update", "at most", "transport on Ray"):
@@ -67,7 +67,8 @@ def curriculum(
         raise typer.Exit(1)
 
 
-def _ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
+def ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
+    """CPU seconds of one stock PPO update on PointMass: the median of `repeats`."""
     train, test = sample("pointmass_uniform", 100, 100, 0)
     setup = make_setup(config, train, test)
     cluster, learner = InProcess(config, setup), learner_of(config)
