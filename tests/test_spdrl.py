@@ -255,3 +255,24 @@ def test_the_limit_holds_only_while_the_target_is_far() -> None:
         for _ in range(6):
             state, selection, _ = one.step(state, feedback(state, selection.contexts))
         assert bool((np.diag(state.factor) >= least - 1e-9).all()) == held
+
+
+def test_values_that_hardly_differ_let_it_go_all_the_way_to_a_narrow_target() -> None:
+    """Klink et al.'s initial and target distributions on PointMass, and their limits; the policy is made up."""
+    bounds = ContextBounds(("gate_x", "gate_width", "friction"), np.array([-4.0, 0.5, 0.0]), np.array([4.0, 8.0, 4.0]))
+    target = Gaussian.of(np.array([2.5, 0.5, 0.0]), np.array([4e-3, 3.75e-3, 2e-3]))
+    one = curriculum(
+        draws=Draws(40, 4), bounds=bounds, target=target, warm_up=0, offset=5, zeta=1.6, least_std_until=8000.0,
+        initial=Gaussian.of(np.array([0.0, 4.25, 2.0]), np.array([2.0, 1.875, 1.0])),
+        least_std=np.array([0.2, 0.1875, 0.1]),
+    )  # fmt: skip
+    state, selection = one.start()
+    for _ in range(79):
+        values = 5.0 + 0.2 * selection.contexts[:, 1]  # wide gates are a little better
+        state, selection, numbers = one.step(state, feedback(state, selection.contexts, values))
+        assert numbers["kl_step"] <= EPSILON * 1.001  # type: ignore[operator]
+        if numbers["kl_to_target"] < 1e-3:  # type: ignore[operator]
+            break
+    assert numbers["kl_to_target"] < 1e-3  # type: ignore[operator]
+    assert state.updates > 40  # no faster than the trust region allows
+    np.testing.assert_allclose(selection.contexts.mean(axis=0), [2.5, 0.5, 0.0], atol=0.01)

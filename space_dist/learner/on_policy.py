@@ -146,6 +146,7 @@ def mean_sizes(shards: Sequence[Shard], numbers: NDArray[np.float32]) -> NDArray
     for shard in shards:
         episodes, slots = shard.episodes, shard.episodes.slots + first
         ends = episodes.starts + episodes.lengths
-        means.append((sums[ends, slots] - sums[episodes.starts, slots]) / episodes.lengths)
+        with np.errstate(invalid="ignore"):  # of infinite rewards: the update says that training diverged
+            means.append((sums[ends, slots] - sums[episodes.starts, slots]) / episodes.lengths)
         first += shard.rewards.shape[1]
     return np.concatenate(means)
