@@ -52,6 +52,8 @@ def curricula(
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
 ) -> None:
     """What each curriculum costs beside round robin with 100 instances, as a share of one PPO update."""
+    import sklearn.mixture  # noqa: F401 - a second, which ALP-GMM pays once a run and not once an iteration
+
     threadpool_limits(limits=1)
     base = configs.load(ROOT / "configs/pointmass_space.yaml", ["tracking.uri=null"])
     update = ppo_update_seconds(base, 7)
