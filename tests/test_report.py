@@ -330,12 +330,21 @@ def test_runs_of_equal_settings_are_one_configuration_whatever_they_are_called(t
     assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday", 2), ("tuesday", 1)]
 
 
+def written(ledger: Ledger, file: str, content: str) -> None:
+    """Give a run another file, as if it had been started with it."""
+    (ledger.folder / file).write_text(content)
+    with RunWriter(ledger) as writer:
+        writer.status = ledger.status()
+        sha256 = hashlib.sha256(content.encode()).hexdigest()
+        writer.set_status(dataclasses.replace(writer.status, files={**writer.status.files, file: [sha256]}))
+
+
 def test_a_default_written_out_makes_no_other_configuration(tmp_path: Path) -> None:
     for seed in range(2):
         ledger = finished_run(tmp_path / f"s{seed}", 1.0, seed=seed)
         text = ledger.config.read_text()
         assert "kappa: 1" in text
-        ledger.config.write_text(text if seed else text.replace("kappa: 1", "kappa: 1, pic: improvement"))
+        written(ledger, "config.yaml", text if seed else text.replace("kappa: 1", "kappa: 1, pic: improvement"))
     assert len(group([load_run(ledger) for ledger in find_ledgers([tmp_path])])) == 1
 
 
@@ -381,10 +390,7 @@ def test_damage_is_named(tmp_path: Path, file: str, content: str, message: str) 
     if file in ledger.status().files:
         with pytest.raises(LedgerError, match="its checksum is not the one"):
             load_run(ledger)
-        with RunWriter(ledger) as writer:  # as if the run had been started with it
-            writer.status = ledger.status()
-            sha256 = hashlib.sha256(content.encode()).hexdigest()
-            writer.set_status(dataclasses.replace(writer.status, files={file: [sha256]}))
+        written(ledger, file, content)
     with pytest.raises(LedgerError, match=message):
         load_run(ledger)
 
