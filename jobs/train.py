@@ -1,16 +1,17 @@
-"""Train one run: `ray job submit --working-dir . -- python jobs/train.py CONFIG --out /shared/run`.
+"""Train one run: `ray job submit --working-dir . -- python jobs/train.py configs/pointmass_space.yaml`.
 
-Takes the arguments of `space-dist train`. Inside a Ray job (RAY_ADDRESS is set there) the run joins that cluster.
+Takes the arguments of `space-dist train`. Inside a Ray job the run joins that cluster, and its folder is below
+`~/space_dist/runs` unless `--out` names another absolute one.
 """
 
-import os
 import sys
 
 from space_dist.cli import main
+from space_dist.launch import in_ray_job
 
 if __name__ == "__main__":
     arguments = ["train", *sys.argv[1:]]
-    if os.environ.get("RAY_ADDRESS") and not any("resources.address" in argument for argument in arguments):
+    if in_ray_job() and not any("resources.address" in argument for argument in arguments):
         arguments += ["--set", "resources.address=auto"]
     sys.argv[1:] = arguments
     main()

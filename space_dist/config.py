@@ -10,7 +10,8 @@ import reprlib
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
@@ -20,27 +21,31 @@ from ruamel.yaml.events import AliasEvent
 
 from space_dist.errors import ConfigError, nearest
 
+M = TypeVar("M", bound=BaseModel)
+
 _MAX_CONFIG_BYTES = 64 << 10
 _MAX_ALIASES = 20  # each may double what a file means
 _MAX_WORD = 100  # characters of a key
 _MAX_LIST = 10_000
 _MAX_BRACKETS = 200  # open at once
 _MAX_NESTING = 50
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A part of a config: nothing unknown, nothing converted, nothing changed later."""
+
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
 
-class EnvConfig(_Section):
+class EnvConfig(Section):
     """The environment."""
 
     id: str = Field(min_length=1, max_length=300)
-    """Registered id (space_dist/PointMass-v0) or import path of a function that makes a batched environment
-    (my_package.my_module:make)."""
+    """Registered id (space_dist/PointMass-v0) or import path (my_package.my_module:make): of a Gymnasium environment
+    with a context_space, of a function that makes one or a batched environment, or of a class of CARL's."""
     kwargs: dict[str, bool | int | float | str] = {}
     """Arguments of the environment, by name. What they mean, and their units, is the environment's."""
     context_visible: bool = True
@@ -48,7 +53,7 @@ class EnvConfig(_Section):
     value-based curricula need it where all episodes start alike."""
 
 
-class InstancesConfig(_Section):
+class InstancesConfig(Section):
     """The instance sets."""
 
     train: Path = Field(strict=False)
@@ -58,7 +63,24 @@ class InstancesConfig(_Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-class GrowingConfig(_Section):
+class _Curriculum(Section):
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """Whether it makes no sense where the policy cannot tell instances apart at their start."""
+        return False
+
+    @property
+    def probes(self) -> bool:
+        """Whether it runs probe episodes, whose steps cannot be foreseen."""
+        return False
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of the training instances' CSV that it reads, beside id and features."""
+        return ()
+
+
+class GrowingConfig(_Curriculum):
     """What all curricula share whose set grows by SPaCE's rule."""
 
     eta: float = Field(default=0.1, gt=0.0)
@@ -109,6 +131,19 @@ class SpaceConfig(GrowingConfig):
     allow_context_blind: bool = False
     """Run even though the policy cannot tell instances apart at their start (the released code's PointMass): all values
     tie, and the order is a random one."""
+    reverse: bool = False
+    """Rank the other way round: a control. Source: ours."""
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return self.pic != "random" and not self.allow_context_blind
+
+    @model_validator(mode="after")
+    def _something_to_reverse(self) -> Self:
+        if self.reverse and self.pic == "random":
+            raise ValueError("reverse: true changes nothing with pic: random")
+        return self
 
 
 class RandomGrowthConfig(GrowingConfig):
@@ -132,16 +167,18 @@ class ContextSpaceConfig(GrowingConfig):
     distance: Literal["centroid", "nearest_member"] = "centroid"
     """Euclidean distance, with each feature scaled from its bounds to [-1, 1], to what of the current set: its mean, or
     its nearest instance, which never drops one. Source: the released code (with L1); ours."""
+    reverse: bool = False
+    """Rank the other way round, the farthest first: a control. Source: ours."""
 
 
-class RoundRobinConfig(_Section):
+class RoundRobinConfig(_Curriculum):
     """All instances in turn, in a random order fixed by the seed (the paper's first baseline, section 5.2)."""
 
     kind: Literal["round_robin"]
     """Which curriculum: round robin."""
 
 
-class FixedConfig(_Section):
+class FixedConfig(_Curriculum):
     """Control: round robin over a part of the training instances. Give either `ids` or `count`."""
 
     kind: Literal["fixed"]
@@ -160,12 +197,206 @@ class FixedConfig(_Section):
         return self
 
 
+class ManualConfig(GrowingConfig):
+    """Control: grows in an order that a person wrote down, as a column of the training instances' CSV."""
+
+    kind: Literal["manual"]
+    """Which curriculum: a manual order."""
+    column: str = Field(min_length=1, max_length=100)
+    """Column of instances.train with one number per instance, of any unit: the lowest come first. Source: ours."""
+    growth: Literal["add", "multiply", "schedule"] = "schedule"
+    """schedule: S + kappa after every iteration with a gradient step, whatever the values. add: S + kappa when values
+    settle. multiply: S * kappa then (kappa of at least 2). Source: ours; as SPaCE's."""
+    reverse: bool = False
+    """Highest first. Source: ours."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return (self.column,)
+
+
+class UniformConfig(_Curriculum):
+    """Domain randomisation over the set: every episode's instance is drawn uniformly."""
+
+    kind: Literal["uniform"]
+    """Which curriculum: uniform random."""
+
+
+class SelfPacedConfig(_Curriculum):
+    """SPDRL (Klink et al. 2020): contexts from a normal distribution that moves from an initial one to a target.
+
+    The defaults are the authors' PPO settings on PointMass.
+    """
+
+    kind: Literal["spdrl"]
+    """Which curriculum: self-paced deep RL."""
+    initial_mean: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=_MAX_LIST, strict=False)
+    """Mean of the first contexts, one number a feature, in environment units; null: the middle of the bounds. Source:
+    Klink et al. 2020 on PointMass, which is that middle."""
+    initial_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=_MAX_LIST, strict=False
+    )
+    """Standard deviations of the first contexts, in environment units; null: a quarter of the bounds' width. Source:
+    Klink et al. 2020 on PointMass, which is that quarter."""
+    target: Literal["normal", "set_moments"] = "set_moments"
+    """What the distribution moves to. normal: target_mean and target_std. set_moments: mean and covariance of the
+    training instances. Source: Klink et al. 2020; ours, for sets that are not drawn from a normal distribution."""
+    target_mean: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=_MAX_LIST, strict=False)
+    """With target: normal, its mean, one number a feature, in environment units."""
+    target_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=_MAX_LIST, strict=False
+    )
+    """With target: normal, its standard deviations, in environment units."""
+    zeta: float = Field(default=1.6, gt=0.0)
+    """Weight of the pull to the target: alpha is zeta * mean discounted return / KL. Source: Klink et al. 2020,
+    PointMass (1.6)."""
+    offset: int = Field(default=10, ge=0)
+    """Moves before this one, counted from 1, have alpha 0. Source: Klink et al. 2020, PointMass (PPO 10, TRPO 20)."""
+    epsilon: float = Field(default=0.05, gt=0.0)
+    """Trust region: largest KL divergence, in nats, from one distribution to the next. Source: Klink et al. 2020."""
+    warm_up: int = Field(default=5, ge=0)
+    """Iterations before the distribution first moves. Source: Klink et al. 2020."""
+    optimiser: Literal["trust_constr", "conjugate_gradient"] = "trust_constr"
+    """trust_constr: SciPy's, with the least standard deviations as bounds. conjugate_gradient: one natural gradient
+    step with line search, the standard deviations clamped behind it. Source: Klink et al. 2021 (JMLR); Klink et al.
+    2020."""
+    least_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=_MAX_LIST, strict=False
+    )
+    """The diagonal of the Cholesky factor stays at least this, in environment units, while the target is far; null:
+    no limit. Source: Klink et al. 2020, PointMass (0.2, 0.1875, 0.1)."""
+    least_std_until: float = Field(default=8000.0, ge=0.0)
+    """The target is far while KL(p || target) is above this, in nats. Source: Klink et al. 2020."""
+    allow_context_blind: bool = False
+    """Run even though the policy cannot tell contexts apart at their start: all values tie, and only the target
+    pulls."""
+
+    @model_validator(mode="after")
+    def _whole_target(self) -> Self:
+        given = (self.target_mean is not None, self.target_std is not None)
+        if self.target == "normal" and not all(given):
+            raise ValueError("target: normal needs target_mean and target_std")
+        if self.target == "set_moments" and any(given):
+            raise ValueError("target_mean and target_std say nothing with target: set_moments; use target: normal")
+        return self
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return not self.allow_context_blind
+
+
+class ValueDisagreementConfig(_Curriculum):
+    """The VDS sampler (Zhang et al. 2020) under our learner: instances whose value an ensemble disagrees about.
+
+    The original is HER with DDPG and an ensemble of Q-functions over a replay buffer.
+    """
+
+    kind: Literal["vds"]
+    """Which curriculum: value disagreement."""
+    members: int = Field(default=3, ge=2, le=100)
+    """Value functions in the ensemble. Source: Zhang et al. 2020 (3)."""
+    members_see: tuple[str, ...] | None = Field(default=None, min_length=1, max_length=_MAX_LIST, strict=False)
+    """Features of the context that the members see, such as the goal alone; null: all. The policy sees all in any
+    case. Source: the SPaCE paper, section 5.2 (on Ant, VDS knows goals only)."""
+    learning_rate: float = Field(default=1e-3, gt=0.0)
+    """Step size of the members' Adam. Source: Zhang et al. 2020 (1e-3)."""
+    batch_size: int = Field(default=1000, ge=1)
+    """Transitions per minibatch of the members, at most a round's. Source: Zhang et al. 2020 (1,000)."""
+    n_batches: int = Field(default=100, ge=1)
+    """Minibatches per update. Source: Zhang et al. 2020 (100 a cycle)."""
+    td_lambda: float = Field(default=0.95, ge=0.0, le=1.0)
+    """Lambda of the returns that each member is fitted to, bootstrapped from itself. Source: ours; the original
+    bootstraps Q-functions by one step (0), from a replay buffer."""
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return True
+
+
+class AlpGmmConfig(_Curriculum):
+    """ALP-GMM (Portelas et al. 2019): contexts from a mixture, in proportion to absolute learning progress."""
+
+    kind: Literal["alp_gmm"]
+    """Which curriculum: ALP-GMM."""
+    over: Literal["set", "bounds"] = "set"
+    """set: the training instance nearest to a sample. bounds: the sample itself, generated within the environment's
+    bounds. Source: ours; Portelas et al. 2019."""
+    random_share: float = Field(default=0.3, ge=0.0, le=1.0)
+    """Share of uniform draws. Source: Klink et al. 2021 (JMLR), PointMass (PPO 0.3, TRPO 0.2)."""
+    fit_rate: int = Field(default=100, ge=1)
+    """Finished episodes between fits, rows of a fit, and uniform episodes at the start. Source: Klink et al. 2021
+    (JMLR), PointMass (PPO 100, TRPO 50)."""
+    history: int = Field(default=500, ge=1)
+    """Finished episodes among which the nearest earlier context is sought. Source: Klink et al. 2021 (JMLR), PointMass
+    (500)."""
+    components: int = Field(default=10, ge=2, le=100)
+    """Most components of the mixture; from 2 on, AIC chooses. Source: Portelas et al. 2019 (10)."""
+
+    @model_validator(mode="after")
+    def _enough_rows(self) -> Self:
+        if self.fit_rate < self.components:
+            raise ValueError(f"fit_rate: {self.fit_rate} rows cannot tell {self.components} components apart; "
+                             f"fit_rate must be at least components")  # fmt: skip
+        return self
+
+
+class LevelReplayConfig(_Curriculum):
+    """Prioritised level replay (Jiang et al. 2021): by rank of mean |GAE|, and by how long ago. On-policy learners."""
+
+    kind: Literal["plr"]
+    """Which curriculum: prioritised level replay."""
+    temperature: float = Field(default=0.1, gt=0.0)
+    """Beta: the chance of rank r is proportional to r^(-1/beta). Source: Jiang et al. 2021 (0.1)."""
+    staleness_share: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Rho: weight of the time since an instance was last trained on. Source: Jiang et al. 2021 (0.1)."""
+
+
+class LearnabilityConfig(_Curriculum):
+    """Sampling for learnability (SFL; Rutherford et al. 2024): instances of highest p (1 - p), p the success rate.
+
+    Needs an environment that reports success. Probe episodes cost environment steps, which the budget is charged.
+    """
+
+    kind: Literal["learnability"]
+    """Which curriculum: learnability."""
+    top: int = Field(default=20, ge=1)
+    """Instances that are drawn as learnable. Source: ours, a fifth of 100 (the paper: 1,000 of 5,000)."""
+    uniform_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Share of draws from all instances. Source: Rutherford et al. 2024 (0.5)."""
+    every: int = Field(default=50, ge=1)
+    """Iterations between probes; the first follows the first iteration. Source: Rutherford et al. 2024 (50)."""
+    candidates: int | None = Field(default=None, ge=1)
+    """Instances that a probe takes, at random; null: all. Source: ours."""
+    episodes: int = Field(default=4, ge=2, le=1000)
+    """Probe episodes of each candidate, with the acting policy. Source: ours."""
+
+    @property
+    def probes(self) -> bool:
+        """See `_Curriculum`."""
+        return True
+
+
 CurriculumConfig = Annotated[
-    SpaceConfig | RoundRobinConfig | RandomGrowthConfig | ContextSpaceConfig | FixedConfig, Field(discriminator="kind")
+    SpaceConfig
+    | RoundRobinConfig
+    | RandomGrowthConfig
+    | ContextSpaceConfig
+    | FixedConfig
+    | ManualConfig
+    | UniformConfig
+    | SelfPacedConfig
+    | ValueDisagreementConfig
+    | AlpGmmConfig
+    | LevelReplayConfig
+    | LearnabilityConfig,
+    Field(discriminator="kind"),
 ]
 
 
-class _Learner(_Section):
+class _Learner(Section):
     policy: str = Field(default="MlpPolicy", min_length=1, max_length=300)
     """SB3's MlpPolicy (acts in NumPy, without torch), CnnPolicy (images), MultiInputPolicy (dictionaries), or the
     import path of a policy class (my_package.my_module:MyPolicy)."""
@@ -370,7 +601,7 @@ LearnerConfig = Annotated[
 ]
 
 
-class RolloutConfig(_Section):
+class RolloutConfig(Section):
     """How transitions are collected. All of it decides results; how many workers share the shards does not."""
 
     shards: int = Field(default=4, ge=1, le=4096)
@@ -385,7 +616,7 @@ class RolloutConfig(_Section):
     one state (PointMass)."""
 
 
-class BudgetConfig(_Section):
+class BudgetConfig(Section):
     """How long a run is."""
 
     steps: int = Field(ge=1, le=10**12)
@@ -394,7 +625,7 @@ class BudgetConfig(_Section):
     """Training episodes after which the run ends if its steps have not; null: no such limit."""
 
 
-class EvaluationConfig(_Section):
+class EvaluationConfig(Section):
     """Deterministic evaluation on every training and test instance, on environments and seeds of its own."""
 
     every_steps: int | Literal["log"] = Field(default=10_000)
@@ -412,7 +643,7 @@ class EvaluationConfig(_Section):
         return value
 
 
-class CheckpointConfig(_Section):
+class CheckpointConfig(Section):
     """When the run makes its progress permanent; it does so too when asked to stop. Decides no result."""
 
     every_rounds: int = Field(default=20, ge=1)
@@ -421,7 +652,15 @@ class CheckpointConfig(_Section):
     """Seconds between checkpoints, at most (and at least one update)."""
 
 
-class TrackingConfig(_Section):
+def checked_uri(value: str | None) -> str | None:
+    """A tracking URI of a kind we know. Raises ValueError for any other."""
+    kinds = ("sqlite:///", "http://", "https://")
+    if value is not None and not any(value.startswith(kind) and value != kind for kind in kinds):
+        raise ValueError("a tracking URI is sqlite:///FILE or http(s)://HOST:PORT")
+    return value
+
+
+class TrackingConfig(Section):
     """Where MLflow keeps its mirror of the run. Decides no result."""
 
     uri: str | None = Field(default="sqlite:///mlflow.db", max_length=2000)
@@ -432,16 +671,13 @@ class TrackingConfig(_Section):
     @field_validator("uri")
     @classmethod
     def _known_kind(cls, value: str | None) -> str | None:
-        kinds = ("sqlite:///", "http://", "https://")
-        if value is not None and not any(value.startswith(kind) and value != kind for kind in kinds):
-            raise ValueError("a tracking URI is sqlite:///FILE or http(s)://HOST:PORT")
-        return value
+        return checked_uri(value)
 
     live: bool = True
     """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
 
 
-class ResourcesConfig(_Section):
+class ResourcesConfig(Section):
     """What the run may use. Decides no result."""
 
     workers: int = Field(default=1, ge=0, le=4096)
@@ -460,10 +696,10 @@ class ResourcesConfig(_Section):
     """The same limit for an actor's start, and for calls of a kind that has not been answered yet."""
 
 
-class RunConfig(_Section):
+class RunConfig(Section):
     """One run."""
 
-    name: str = Field(pattern=_NAME)
+    name: str = Field(pattern=NAME)
     """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
     """The one number from which every random number of the run comes."""
@@ -516,7 +752,7 @@ class RunConfig(_Section):
         return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots
 
 
-NOT_IDENTITY = ("checkpoint", "tracking", "resources")  # sections that cannot change a result
+NOT_IDENTITY = ("name", "checkpoint", "tracking", "resources")  # what cannot change a result
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
@@ -525,13 +761,7 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
     Relative instance paths become absolute, from the config's folder (from the current one in an override).
     Raises ConfigError with the file and key of every fault.
     """
-    data = _read_yaml(path)
-    instances = data.get("instances")
-    if isinstance(instances, dict):
-        folder = path.absolute().parent
-        data["instances"] = {
-            key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()
-        }
+    data = read(path)
     for override in overrides:
         _apply(data, override)
     if seed is not None:
@@ -540,12 +770,31 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
     return parse(data, str(path), origins)
 
 
+def read(path: Path) -> dict[str, Any]:
+    """A run's config as plain data, not checked yet; relative instance paths become absolute, from its folder."""
+    data = read_yaml(path)
+    instances = data.get("instances")
+    if isinstance(instances, dict):
+        data["instances"] = from_folder(instances, path.absolute().parent)
+    return data
+
+
+def from_folder(instances: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The `instances` section with its relative paths taken from `folder`."""
+    return {key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()}
+
+
 def parse(data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> RunConfig:
-    """Check plain data against the schema. `origins` says which keys came from elsewhere than `source`."""
+    """Check plain data against the schema of a run. `origins` says which keys came from elsewhere than `source`."""
+    return check(RunConfig, data, source, origins)
+
+
+def check(model: type[M], data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> M:
+    """Check plain data against any schema made of sections. Raises ConfigError with the key of every fault."""
     try:
-        return RunConfig.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
-        faults = [_explain(fault, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
+        faults = [_explain(fault, model, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
         raise ConfigError("\n".join(dict.fromkeys(faults))) from None
 
 
@@ -554,10 +803,22 @@ def dump(config: RunConfig) -> str:
     return to_yaml(config.model_dump(mode="json"))
 
 
-def identity(config: RunConfig, train_digest: str, test_digest: str) -> str:
-    """`(64 hex digits)` a hash of everything that decides the run's results, instance files by their content."""
-    data = config.model_dump(mode="json", exclude=set(NOT_IDENTITY))
+def identity(
+    config: RunConfig, train_digest: str, test_digest: str, *, sources: Mapping[str, str] = MappingProxyType({}),
+    with_seed: bool = True,
+) -> str:  # fmt: skip
+    """`(64 hex digits)` a hash of everything that decides the run's results; without its seed, that of a grid's cell.
+
+    Instance files count by their content, and so does a user's own code: `sources`, by import path. Fields at their
+    default are left out, so that a field that is added later changes no identity.
+    """
+    exclude = {*NOT_IDENTITY, "seed"}
+    data = config.model_dump(mode="json", exclude=exclude, exclude_defaults=True)
     data["instances"] = {"train": train_digest, "test": test_digest}
+    if sources:
+        data["sources"] = dict(sources)
+    if with_seed:
+        data["seed"] = config.seed
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -593,7 +854,8 @@ def to_yaml(data: Mapping[str, Any]) -> str:
     return buffer.getvalue()
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The keys and values of a YAML file that is small, plain and UTF-8. Raises ConfigError otherwise."""
     try:
         if path.is_dir():
             raise ConfigError(f"{path} is a folder; a config is a YAML file")
@@ -648,19 +910,19 @@ def _parse_yaml(content: bytes | str, source: str) -> Any:
     except DuplicateKeyError as error:
         where = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = str(error.problem).split(" with value")[0]
-        raise ConfigError(f"{source}{where}: {_clean(problem)}: every key may stand once") from None
+        raise ConfigError(f"{source}{where}: {clean(problem)}: every key may stand once") from None
     except YAMLError as error:
         mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
         where = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else str(error)
-        raise ConfigError(f"{source}{where} is not valid YAML: {_clean(str(problem))}") from None
+        raise ConfigError(f"{source}{where} is not valid YAML: {clean(str(problem))}") from None
     except _ValueFaultError as error:
         raise ConfigError(f"{source}: {error}") from None
     except RecursionError:
         raise ConfigError(f"{source} is nested too deeply") from None
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, NotImplementedError,
             AssertionError) as error:  # fmt: skip  # ruamel asserts that %YAML names a version it knows
-        raise ConfigError(f"{source} is not valid YAML: {_clean(str(error))}") from None
+        raise ConfigError(f"{source} is not valid YAML: {clean(str(error))}") from None
 
 
 def _refuse_tricks(text: str, source: str) -> None:
@@ -677,7 +939,7 @@ def _refuse_tricks(text: str, source: str) -> None:
         if tag is not None and str(tag) != "!":
             line = event.start_mark.line + 1
             raise ConfigError(
-                f"{source}, line {line} is not valid YAML for a config: tags like {_clean(str(tag))!r} are not read"
+                f"{source}, line {line} is not valid YAML for a config: tags like {clean(str(tag))!r} are not read"
             )
     if aliases > _MAX_ALIASES:
         raise ConfigError(f"{source} has {aliases} aliases; at most {_MAX_ALIASES} are read")
@@ -711,6 +973,17 @@ def _plain(value: Any, path: tuple[str, ...] = ()) -> Any:
     raise fault(f"{_short(value)} is a {type(value).__name__}; write numbers, words, lists and keys only")
 
 
+def put(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+    """Set `a.b` in nested data, making sections on the way. Raises ConfigError if `a` is no section."""
+    section: Any = data
+    *parents, last = key.split(".")
+    for part in parents:
+        section = section.setdefault(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"{where}: {part!r} is not a section")
+    section[last] = value
+
+
 def _apply(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
@@ -719,12 +992,7 @@ def _apply(data: dict[str, Any], override: str) -> None:
     value = _parse_yaml(text, f"--set {override}")
     if parts[0] == "instances":
         value = _from_here(value)
-    section: Any = data
-    for part in parts[:-1]:
-        section = section.setdefault(part, {})
-        if not isinstance(section, dict):
-            raise ConfigError(f"--set {override}: {part!r} is not a section")
-    section[parts[-1]] = value
+    put(data, ".".join(parts), value, f"--set {override}")
 
 
 def _from_here(value: Any) -> Any:
@@ -734,8 +1002,8 @@ def _from_here(value: Any) -> Any:
     return str(Path(value).absolute()) if isinstance(value, str) and value else value
 
 
-def _explain(fault: Any, source: str, origins: Mapping[str, str]) -> str:
-    path, model = _locate(fault["loc"])
+def _explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str, str]) -> str:
+    path, model = _locate(fault["loc"], root)
     if fault["type"].startswith("union_tag"):
         path.append("kind")
     key = ".".join(path)
@@ -769,10 +1037,10 @@ def _tags(key: str) -> str:
     )
 
 
-def _locate(location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel] | None]:
+def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[list[str], type[BaseModel] | None]:
     """Pydantic's location without the tags of unions, and the section it lies in."""
     path: list[str] = []
-    model: type[BaseModel] | None = RunConfig
+    model: type[BaseModel] | None = root
     options: list[type[BaseModel]] = []
     for part in location:
         tagged = [option for option in options if get_args(option.model_fields["kind"].annotation)[0] == part]
@@ -822,7 +1090,7 @@ def _type_name(field: Any) -> str:
     return " ".join([name, *limits])
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """At most 200 characters of somebody else's text, none of which commands a terminal."""
     line = (text.splitlines() or [""])[0][:200]
     return "".join(character if character.isprintable() else repr(character)[1:-1] for character in line)

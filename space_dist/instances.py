@@ -10,7 +10,7 @@ import hashlib
 import stat
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import ConfigError, nearest
+from space_dist.mazes import CELLS, SIDE, carve, symmetrised
 from space_dist.seeding import Purpose, generator
 
 MAX_FILE_BYTES: Final = 512 * 2**20
@@ -80,15 +81,17 @@ class InstanceSet:
     """At least one instance, sorted by id, so that the order of a file's rows can decide nothing.
 
     `ids` are `(n,)` int64, ascending, unique and >= 0; `contexts` `(n, d)` float64 in the order of `ids`, without
-    negative zeros; `names` the d features. Both arrays are copies and read-only. Raises ConfigError for anything else.
+    negative zeros; `names` the d features. `columns` are further numbers about each instance, `(n,)` by name, which no
+    environment and no policy sees. All arrays are copies and read-only. Raises ConfigError for anything else.
     """
 
     ids: NDArray[np.int64]
     contexts: NDArray[np.float64]
     names: tuple[str, ...]
+    columns: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_names(self.names)
+        _check_names((*self.names, *self.columns))
         given = np.asarray(self.ids)
         contexts = np.asarray(self.contexts, dtype=np.float64)
         if contexts.ndim != 2 or given.shape != contexts.shape[:1] or contexts.shape[1] != len(self.names):
@@ -114,6 +117,13 @@ class InstanceSet:
             raise ConfigError(f"two instances have the id {ids[repeated[0]]}")
         # + 0.0 turns -0.0 into 0.0: equal contexts shall have equal bytes, and so equal digests
         _freeze(self, ids=ids, contexts=contexts[order] + 0.0)
+        columns = {name: np.asarray(values, dtype=np.float64) for name, values in self.columns.items()}
+        for name, values in columns.items():
+            if values.shape != given.shape or not np.isfinite(values).all():
+                raise ConfigError(f"the column {_shown(name)} must hold one finite number for each instance")
+            columns[name] = values[order] + 0.0
+            columns[name].setflags(write=False)
+        object.__setattr__(self, "columns", columns)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -125,16 +135,19 @@ class InstanceSet:
             self.names == other.names
             and np.array_equal(self.ids, other.ids)
             and np.array_equal(self.contexts, other.contexts)
+            and list(self.columns) == list(other.columns)
+            and all(np.array_equal(self.columns[name], other.columns[name]) for name in self.columns)
         )
 
     def __hash__(self) -> int:
         return hash((self.names, self.ids.tobytes(), self.contexts.tobytes()))
 
     def to_csv(self) -> str:
-        r"""The one canonical text of this set: `id,<names>`, rows by id, shortest round-trip floats, `\n` ends."""
-        rows = zip(self.ids.tolist(), self.contexts.tolist(), strict=True)
-        lines = [",".join((str(identity), *map(repr, context))) for identity, context in rows]
-        return "\n".join((",".join(("id", *self.names)), *lines, ""))
+        r"""The one canonical text of this set: `id,<names>,<columns>`, by id, shortest round-trip floats, `\n` ends."""
+        numbers = np.column_stack((self.contexts, *self.columns.values()))
+        rows = zip(self.ids.tolist(), numbers.tolist(), strict=True)
+        lines = [",".join((str(identity), *map(repr, row))) for identity, row in rows]
+        return "\n".join((",".join(("id", *self.names, *self.columns)), *lines, ""))
 
     def digest(self) -> str:
         """SHA-256, in hex, of the canonical text in UTF-8: equal for equal sets whatever file they came from."""
@@ -149,27 +162,33 @@ class InstanceSet:
         chosen = np.asarray(indices)
         if not np.issubdtype(chosen.dtype, np.integer):
             raise ConfigError(f"a subset is chosen by at least one position, a whole number, not by {chosen.dtype}")
-        return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names)
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names, columns)
 
 
-def read_csv(path: Path, bounds: ContextBounds) -> InstanceSet:
+def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False) -> InstanceSet:
     r"""The instances of a CSV file, checked whole.
 
-    The first line names `id` and exactly the features of `bounds`, in any order; each further line is one instance.
+    The first line names `id`, the features of `bounds` and the further `columns`, in any order, and nothing else; each
+    further line is one instance. With `if_there`, `columns` may be missing.
     Cells are separated by commas; spaces around a cell, double quotes around a cell, a byte order mark, `\r\n` and
     blank lines at the end are accepted. Features come back in the order of `bounds`.
 
     Raises ConfigError, naming the file and where it can the row (the line as an editor numbers it) and the column,
     if the file cannot be read or is larger than 512 MiB, if ids are not whole numbers from 0 to 2**63 - 1, if a
-    feature is not a number within its bounds, or if an id or a context occurs twice.
+    feature is not a number within its bounds, a further column not a finite number, or if an id or a context occurs
+    twice.
     """
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:
-            columns = _read_header(file, bounds)
-            ids, contexts = _read_rows(file, columns, bounds)
+            header = _read_header(file, bounds, columns, if_there)
+            found = [name for name in columns if name in header]
+            ids, numbers = _read_rows(file, header, bounds, found)
+        d = len(bounds.names)
+        contexts = numbers[:, :d]
         _refuse_repeats(ids, contexts)
-        return InstanceSet(ids, contexts, bounds.names)
+        return InstanceSet(ids, contexts, bounds.names, {name: numbers[:, d + i] for i, name in enumerate(found)})
     except ConfigError as fault:
         raise ConfigError(f"{_shown_path(path)}: {fault}") from None
     except OSError as error:
@@ -252,9 +271,10 @@ def _split(row: int, line: bytes) -> list[bytes]:
     return cells
 
 
-def _read_header(file: BinaryIO, bounds: ContextBounds) -> list[str]:
-    """The names of the columns, as the file orders them: `id` and each feature, once each."""
-    expected = ("id", *bounds.names)
+def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], if_there: bool) -> list[str]:
+    """The names of the columns, as the file orders them: `id`, each feature and the further ones, once each."""
+    required = ("id", *bounds.names, *(() if if_there else further))
+    expected = ("id", *bounds.names, *further)
     allowed = f"allowed are {_cut(', '.join(expected), 200)}, each once, separated by commas"
     row, line = next(_lines(file, first_row=1), (1, b""))
     line = line.removeprefix(b"\xef\xbb\xbf")
@@ -274,16 +294,18 @@ def _read_header(file: BinaryIO, bounds: ContextBounds) -> list[str]:
         if column in seen:
             raise ConfigError(f"row 1: the column {_shown(column)} is there twice ({allowed})")
         seen.add(column)
-    for name in expected:
+    for name in required:
         if name not in seen:
             raise ConfigError(f"row 1: the column {_shown(name)} is missing ({allowed})")
     return columns
 
 
 def _read_rows(
-    file: BinaryIO, columns: Sequence[str], bounds: ContextBounds
+    file: BinaryIO, columns: Sequence[str], bounds: ContextBounds, further: Sequence[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """`(n,)` ids and `(n, d)` contexts, features in the order of `bounds`, instances in that of the file.
+    """`(n,)` ids and `(n, d + k)` numbers: features in the order of `bounds`, then `further` columns.
+
+    Instances come in the order of the file.
 
     Row i stands on line i + 2 of the file, because no blank line is accepted before another row.
     """
@@ -293,6 +315,8 @@ def _read_rows(
         (columns.index(name), low, high)
         for name, low, high in zip(bounds.names, bounds.low.tolist(), bounds.high.tolist(), strict=True)
     ]
+    largest = float(np.finfo(np.float64).max)
+    features += [(columns.index(name), -largest, largest) for name in further]
     for row, line in _lines(file, first_row=2):
         if not line:
             _refuse_more(file, row)
@@ -338,6 +362,8 @@ def _cell_fault(row: int, columns: Sequence[str], cells: Sequence[bytes], positi
     cell, column = cells[position].strip(), columns[position]
     if column == "id":
         what, allowed = "is not an id", f"a whole number from 0 to {MAX_ID}"
+    elif column not in bounds.names:
+        what, allowed = "is not a number", "any finite number"
     else:
         feature = bounds.names.index(column)
         allowed = f"a number in [{bounds.low[feature]}, {bounds.high[feature]}]"
@@ -395,9 +421,9 @@ def _check_names(names: tuple[str, ...]) -> None:
 
 def _freeze(owner: ContextBounds | InstanceSet, **arrays: NDArray[np.generic]) -> None:
     """Set fields of a frozen dataclass to arrays that can no longer be written to."""
-    for field, values in arrays.items():
+    for name, values in arrays.items():
         values.setflags(write=False)
-        object.__setattr__(owner, field, values)
+        object.__setattr__(owner, name, values)
 
 
 def _cut(text: str, limit: int) -> str:
@@ -435,15 +461,44 @@ CARTPOLE_BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), h
 four of `cartpole_test.csv` are ours: one between each two of them, and one beyond each end.
 """
 
+ANTGOAL_BOUNDS: Final = ContextBounds(
+    names=("goal_x", "goal_y", "disabled_leg"),
+    low=np.array([-750.0, -750.0, -1.0]),
+    high=np.array([750.0, 750.0, 3.0]),
+)
+"""AntGoal (Eimer et al. 2021): the goal in metres from the start, and the disabled leg, a whole number: -1 for none."""
+
+BALLCATCHING_BOUNDS: Final = ContextBounds(
+    names=("angle", "radius", "distance"),
+    low=np.array([0.125 * np.pi, 0.52, 0.75]),
+    high=np.array([0.5 * np.pi, 0.95, 4.0]),
+)
+"""BallCatching (Klink et al. 2020): angle in radians and radius in metres of the point that the ball flies to, seen
+from the arm's shoulder, and the distance in metres from which it comes.
+
+Klink et al. have radii from 0.6 to 1.1 for their longer arm: ours are these times 0.95 / 1.1, because the net's centre
+reaches 1.07 m.
+"""
+MAZE_BOUNDS: Final = ContextBounds(
+    names=tuple(f"cell_{x}_{y}" for y in range(SIDE) for x in range(SIDE)),
+    low=np.zeros(CELLS),
+    high=np.full(CELLS, 15.0),
+)
+"""Maze: the bits of each cell's open sides (north 1, east 2, south 4, west 8), in reading order; `cell_x_y`."""
+
 
 @dataclass(frozen=True)
 class Distribution:
-    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows."""
+    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows.
+
+    `content` turns `(n, d)` contexts into rows that are equal where two contexts mean the same.
+    """
 
     description: str
     source: str
     bounds: ContextBounds
     draw: Callable[[np.random.Generator, int], NDArray[np.float64]]
+    content: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda contexts: contexts
 
 
 def _draw_pointmass_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
@@ -458,6 +513,12 @@ def _draw_pointmass_target(rng: np.random.Generator, n: int) -> NDArray[np.float
     """
     drawn = rng.normal((2.5, 0.5, 0.0), (4e-3, 3.75e-3, 2e-3), size=(n, 3))
     return np.clip(drawn, POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high)
+
+
+def _draw_antgoal(rng: np.random.Generator, n: int, nearest_goal: float) -> NDArray[np.float64]:
+    """Goals uniform between `nearest_goal` and 750 on each axis; none or one of four legs, each as likely."""
+    goals = rng.uniform(nearest_goal, ANTGOAL_BOUNDS.high[:2], size=(n, 2))
+    return np.column_stack((goals, rng.integers(-1, 4, size=n)))
 
 
 DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
@@ -480,20 +541,57 @@ DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
         bounds=CARTPOLE_BOUNDS,
         draw=lambda rng, n: rng.uniform(CARTPOLE_BOUNDS.low, CARTPOLE_BOUNDS.high, size=(n, 1)),
     ),
+    "antgoal_positive": Distribution(
+        description="AntGoal, goals uniform in the positive quadrant up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021; the quadrant is the released code's",
+        bounds=ANTGOAL_BOUNDS,
+        draw=lambda rng, n: _draw_antgoal(rng, n, 0.0),
+    ),
+    "antgoal_all": Distribution(
+        description="AntGoal, goals uniform in all four quadrants up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021 (goals at most 750 away)",
+        bounds=ANTGOAL_BOUNDS,
+        draw=lambda rng, n: _draw_antgoal(rng, n, -750.0),
+    ),
+    "ballcatching_uniform": Distribution(
+        description="BallCatching, each feature uniform within its bounds",
+        source="Klink et al. 2020 (the bounds); the radius is scaled to our arm",
+        bounds=BALLCATCHING_BOUNDS,
+        draw=lambda rng, n: rng.uniform(BALLCATCHING_BOUNDS.low, BALLCATCHING_BOUNDS.high, size=(n, 3)),
+    ),
+    "maze_dfs": Distribution(
+        description="Maze, perfect 5x5 mazes carved depth first from a random cell, symmetrised",
+        source="gym-maze's generator; the paper released no settings",
+        bounds=MAZE_BOUNDS,
+        draw=carve,
+    ),
+    "maze_dfs_raw": Distribution(
+        description="Maze, the mazes of maze_dfs with the released code's numbers, which depend on where the carving "
+        "began",
+        source="gym-maze's generator",
+        bounds=MAZE_BOUNDS,
+        draw=lambda rng, n: carve(rng, n, raw=True),
+        content=symmetrised,
+    ),
 }
 
 
-def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[InstanceSet, InstanceSet]:
-    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), drawn from one of `DISTRIBUTIONS`.
+def sample(
+    distribution: str, n_train: int, n_test: int, seed: int, known: Mapping[str, Distribution] | None = None
+) -> tuple[InstanceSet, InstanceSet]:
+    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), from one of the `known` (DISTRIBUTIONS).
 
     They are disjoint by construction: one set of distinct contexts is drawn, what repeats drawn again, and then
-    split. A pure function of all four arguments. Raises ConfigError for an unknown distribution, for counts below 1
+    split. A pure function of its arguments. Raises ConfigError for an unknown distribution, for counts below 1
     or above 10 million together, for a negative seed, and if there are not that many distinct contexts to be found.
     """
-    if distribution not in DISTRIBUTIONS:
+    known = DISTRIBUTIONS if known is None else known
+    if distribution not in known:
         raise ConfigError(
-            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], DISTRIBUTIONS)} "
-            f"(known are {', '.join(DISTRIBUTIONS)})"
+            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], known)} "
+            f"(known are {', '.join(known)})"
         )
     total = n_train + n_test
     if min(n_train, n_test) < 1 or total > MAX_INSTANCES:
@@ -503,12 +601,12 @@ def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[Ins
         )
     if seed < 0:
         raise ConfigError(f"the seed {seed} is negative; allowed are whole numbers from 0")
-    chosen = DISTRIBUTIONS[distribution]
+    chosen = known[distribution]
     rng = generator(seed, Purpose.INSTANCES, int.from_bytes(distribution.encode(), "big"), n_train, n_test)
     contexts = np.empty((0, len(chosen.bounds.names)))
     for _ in range(MAX_REDRAWS):
         contexts = np.vstack((contexts, chosen.draw(rng, total - len(contexts))))
-        contexts = np.delete(contexts, _repeats(contexts)[1], axis=0)
+        contexts = np.delete(contexts, _repeats(chosen.content(contexts))[1], axis=0)
         if len(contexts) == total:
             ids, names = np.arange(total), chosen.bounds.names
             train = InstanceSet(ids[:n_train], contexts[:n_train], names)

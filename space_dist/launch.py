@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import io
 import json
 import logging
 import os
-import platform
 import secrets
 import subprocess
 import sys
@@ -30,12 +28,12 @@ from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
 from space_dist.policy import Policy, from_arrays
+from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
 from space_dist.training import Progress, Training, make_env, make_setup, policy_in
 
 log = logging.getLogger("space_dist")
 
-_BITS_DEPEND_ON = ("numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "space-dist")
 _FINAL_PUSH_SECONDS = 120.0
 
 
@@ -49,17 +47,18 @@ class Outcome:
 
 
 def default_folder(config: RunConfig) -> Path:
-    """`runs/<name>/s<seed>` in the current folder."""
-    return Path("runs") / config.name / f"s{config.seed}"
+    """`runs/<name>/s<seed>`, here."""
+    return workplace() / "runs" / config.name / f"s{config.seed}"
 
 
 def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
     """The training and test instances of a config. Raises ConfigError for a bad file, or one that shares a context."""
     bounds = make_env(config).context_bounds
+    columns = config.curriculum.columns
     with about("instances.train"):
-        train = read_csv(config.instances.train, bounds)
+        train = read_csv(config.instances.train, bounds, columns)
     with about("instances.test"):
-        test = read_csv(config.instances.test, bounds)
+        test = read_csv(config.instances.test, bounds, columns, if_there=True)
     refuse_overlap(train, test, str(config.instances.train), str(config.instances.test))
     return train, test
 
@@ -103,7 +102,7 @@ def launch(
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
-                    "resumed on another CPU model or with other library versions: results are valid, but no longer "
+                    "resumed on another CPU model, or with other code or library versions: results are valid, but not "
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
@@ -123,18 +122,6 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
         message = f"stopped by {reason} before its first round; --resume continues"
         writer.set_status(replace(writer.status, state="interrupted", message=reason, updated_at=time.time()))
         raise Interrupted(message)
-
-
-def fingerprint() -> dict[str, str]:
-    """What bit-equality is promised for: the CPU's model and the versions of what computes."""
-    model = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    versions = {name: importlib.metadata.version(name) for name in _BITS_DEPEND_ON}
-    return {"cpu": model, "python": platform.python_version(), **versions}
 
 
 def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
@@ -238,7 +225,30 @@ def _self_contained(config: RunConfig) -> RunConfig:
 def absolute_uri(uri: str | None) -> str | None:
     """A tracking URI that means the same from any folder: `sqlite:///FILE` with the file's absolute path."""
     prefix = "sqlite:///"
-    return f"{prefix}{Path(uri.removeprefix(prefix)).absolute()}" if uri and uri.startswith(prefix) else uri
+    return f"{prefix}{workplace() / uri.removeprefix(prefix)}" if uri and uri.startswith(prefix) else uri
+
+
+def in_ray_job() -> bool:
+    """Whether `ray job submit` started this process."""
+    return "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
+
+
+def workplace() -> Path:
+    """Where results go whose place nobody named: here; from within a Ray job, `~/space_dist`.
+
+    A job's current folder is a copy that Ray removes when it needs the space.
+    """
+    return Path.home() / "space_dist" if in_ray_job() else Path.cwd()
+
+
+def lasting(path: Path, option: str) -> Path:
+    """The absolute path of a folder for results. Raises ConfigError for a relative one from within a Ray job."""
+    if in_ray_job() and not path.is_absolute():
+        raise ConfigError(
+            f"{option} {path}: from within a Ray job the path must be absolute, on storage that outlives the job; "
+            "the job's current folder is a copy that Ray removes when it needs the space"
+        )
+    return path.absolute()
 
 
 def policy_of(ledger: Ledger) -> Policy:

@@ -268,11 +268,16 @@ class Ledger:
 
     def owner_alive(self) -> bool:
         """Whether a live process works on this run now, as far as can be told from this machine."""
-        try:
-            owner = json.loads(self.lock_file.read_bytes() or b"{}")
-        except (OSError, ValueError, RecursionError):
-            return False
-        return isinstance(owner, dict) and _believed_alive(owner)
+        return owner_alive(self.lock_file)
+
+
+def owner_alive(lock_file: Path) -> bool:
+    """Whether a live process holds the lock, as far as can be told from this machine."""
+    try:
+        owner = json.loads(lock_file.read_bytes() or b"{}")
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(owner, dict) and believed_alive(owner)
 
 
 def _read(path: Path, *, missing: bytes | None = None) -> bytes:
@@ -358,7 +363,7 @@ class RunWriter:
 
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
-        self._lock = _Lock(ledger.lock_file)
+        self._lock = Lock(ledger.lock_file)
         self._hashes = {name: hashlib.sha256() for name in ROW_FILES}
         self._sizes = dict.fromkeys(ROW_FILES, 0)
         self._files: dict[str, list[str]] = {}  # SHA-256 of the whole files that this process wrote
@@ -627,7 +632,9 @@ def _refuse(folder: Path, error: OSError) -> NoReturn:
 # ---- the lock -------------------------------------------------------------------------------------------------------
 
 
-def _this_process() -> dict[str, Any]:
+def this_process() -> dict[str, Any]:
+    """Who we are, so that anyone can tell whether we still live: host, boot, namespace, pid, and when it started."""
+
     def read(path: str) -> str:
         try:
             return Path(path).read_text().strip()
@@ -647,11 +654,11 @@ def _this_process() -> dict[str, Any]:
     }
 
 
-def _believed_alive(owner: Mapping[str, Any]) -> bool:
+def believed_alive(owner: Mapping[str, Any]) -> bool:
     """Look the owner up where its processes can be seen from here; else believe its last heartbeat for a lease."""
     if not owner or owner.get("released"):
         return False
-    here = _this_process()
+    here = this_process()
     same_kernel = here["boot_id"] and owner.get("boot_id") == here["boot_id"]
     if same_kernel and owner.get("pid_namespace") == here["pid_namespace"]:
         pid, started = owner.get("pid"), owner.get("started")
@@ -671,12 +678,12 @@ def _started(pid: int) -> int | None:
     return None if fields[0] == b"Z" else int(fields[19])
 
 
-class _Lock:
+class Lock:
     """Ownership of a run, in a file whose every reading and writing happens under `flock`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._me = _this_process()
+        self._me = this_process()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -709,7 +716,7 @@ class _Lock:
     def acquire(self) -> None:
         with self._locked_file() as file:
             owner = self._read(file)
-            if _believed_alive(owner):
+            if believed_alive(owner):
                 raise RunLockedError(
                     f"{self._path.parent} is being worked on by process {owner.get('pid')} on {owner.get('host')}. "
                     "Wait for it to end, or stop it; if it is on a machine that died, its claim ends "

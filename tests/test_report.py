@@ -16,6 +16,8 @@ from space_dist.config import to_yaml
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Ledger, RunWriter, Status, find_ledgers
 from space_dist.report import (
+    Estimate,
+    Interval,
     bootstrap_interval,
     build_report,
     draw_comparison,
@@ -177,9 +179,9 @@ def test_the_interval_is_the_same_in_every_call_and_place() -> None:
 
 def test_one_seed_has_no_interval_and_none_no_number() -> None:
     one, none = estimate(np.array([2.0])), estimate(np.array([]))
-    assert (one.iqm, one.mean, one.median, one.low, one.high) == (2.0, 2.0, 2.0, None, None)
+    assert one == Estimate(1, *[Interval(2.0, None, None)] * 3)
     assert none.n == 0
-    assert np.isnan(none.iqm)
+    assert np.isnan(none.iqm.value)
 
 
 # ---- the report -----------------------------------------------------------------------------------------------------
@@ -245,7 +247,7 @@ def test_set_sizes_are_held_between_their_changes(tmp_path: Path) -> None:
     median = draw_comparison([configuration]).axes[2].get_lines()[-1]
     np.testing.assert_array_equal(median.get_ydata(), [2.0, 2.5, 3.5, 3.5])
 
-    summary = summarise(configuration)
+    (summary,) = summarise([configuration])
     assert (summary.set_size, summary.n_instances, summary.reached, summary.reached_at) == (3.5, 4, 1, 2000)
 
 
@@ -318,6 +320,34 @@ def test_configurations_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert all(label.startswith("space ") for label in labels)
 
 
+def test_runs_of_equal_settings_are_one_configuration_whatever_they_are_called(tmp_path: Path) -> None:
+    finished_run(tmp_path / "a", 1.0, seed=0, name="monday")
+    finished_run(tmp_path / "b", 3.0, seed=1, name="tuesday")
+    runs = [load_run(ledger) for ledger in find_ledgers([tmp_path])]
+    assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday + tuesday", 2)]
+    finished_run(tmp_path / "c", 5.0, seed=1, name="monday")  # the same seed twice: now the names tell them apart
+    runs = [load_run(ledger) for ledger in find_ledgers([tmp_path])]
+    assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday", 2), ("tuesday", 1)]
+
+
+def written(ledger: Ledger, file: str, content: str) -> None:
+    """Give a run another file, as if it had been started with it."""
+    (ledger.folder / file).write_text(content)
+    with RunWriter(ledger) as writer:
+        writer.status = ledger.status()
+        sha256 = hashlib.sha256(content.encode()).hexdigest()
+        writer.set_status(dataclasses.replace(writer.status, files={**writer.status.files, file: [sha256]}))
+
+
+def test_a_default_written_out_makes_no_other_configuration(tmp_path: Path) -> None:
+    for seed in range(2):
+        ledger = finished_run(tmp_path / f"s{seed}", 1.0, seed=seed)
+        text = ledger.config.read_text()
+        assert "kappa: 1" in text
+        written(ledger, "config.yaml", text if seed else text.replace("kappa: 1", "kappa: 1, pic: improvement"))
+    assert len(group([load_run(ledger) for ledger in find_ledgers([tmp_path])])) == 1
+
+
 def test_resources_and_tracking_do_not_make_another_configuration(tmp_path: Path) -> None:
     for seed in range(2):
         finished_run(tmp_path / f"s{seed}", 1.0, seed=seed, uri=f"http://host{seed}:1")
@@ -360,10 +390,7 @@ def test_damage_is_named(tmp_path: Path, file: str, content: str, message: str) 
     if file in ledger.status().files:
         with pytest.raises(LedgerError, match="its checksum is not the one"):
             load_run(ledger)
-        with RunWriter(ledger) as writer:  # as if the run had been started with it
-            writer.status = ledger.status()
-            sha256 = hashlib.sha256(content.encode()).hexdigest()
-            writer.set_status(dataclasses.replace(writer.status, files={file: [sha256]}))
+        written(ledger, file, content)
     with pytest.raises(LedgerError, match=message):
         load_run(ledger)
 
@@ -425,6 +452,6 @@ def test_generated_contexts_have_no_map(tmp_path: Path) -> None:
     continue_run(ledger, [0.0, 0.0], [[-1, -1, -1, -1]])
     run = load_run(ledger)
     assert run.all_instances_reached_at is None
-    with pytest.raises(ConfigError, match="generated contexts"):
-        draw_curriculum(run)
+    with pytest.raises(LedgerError, match="not trained on generated contexts in every iteration"):
+        draw_curriculum(run)  # its ledger does not say which
     assert build_report([ledger], tmp_path / "out").table[0]["set size at the end"] == "—"

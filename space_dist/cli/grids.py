@@ -1,0 +1,554 @@
+"""Commands about grids: plan, run, submit, and what comes afterwards."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
+
+import typer
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from space_dist.cli.terminal import STOP, console, say, warn
+from space_dist.errors import ConfigError, SpaceDistError, nearest
+
+if TYPE_CHECKING:
+    from space_dist.grid import Overview
+    from space_dist.manifest import Grid, Manifest, Run
+    from space_dist.ray_jobs import Mode
+    from space_dist.standing import Standing
+
+grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
+
+GridPath = Annotated[
+    Path,
+    typer.Argument(metavar="GRID", help="A grid's YAML file, its folder, or its manifest.json.", show_default=False),
+]
+Root = Annotated[
+    Optional[Path],  # noqa: UP045 - typer reads annotations at run time
+    typer.Option(help="Folder that holds the grids' folders. Default: runs; within a Ray job ~/space_dist/runs."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Seed = Annotated[int, typer.Option(help="The run's seed.")]
+
+_MODES = ("auto", "pool", "jobs")
+_LOG_SECONDS = 30.0
+_SHOWN_RUNS = 12
+_WATCH_SECONDS = 1.0
+_UNFINISHED = 3
+
+
+@grid_app.command("plan")
+def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
+    """Check a grid, print its cells and what is done already, and freeze its manifest."""
+    from space_dist.grid import plan
+    from space_dist.provenance import code_digest
+    from space_dist.standing import standings
+
+    made = plan(grid, _root(root))
+    manifest = made.manifest
+    found = standings(made.grid, manifest, code_digest())
+    done = [standing for standing in found if standing.condition == "done"]
+    left = sum(standing.budget_steps for standing in found) - sum(standing.steps for standing in found)
+    if as_json:
+        _print_json({
+            "grid": manifest.name, "folder": str(made.grid.folder), "seeds": list(manifest.seeds), "runs": len(found),
+            "cpus_per_run": manifest.cpus_per_run, "steps": made.steps, "steps_left": left, "done": len(done),
+            "new_runs": made.new_runs, "dropped_runs": made.dropped_runs,
+            "cells": [{"id": cell.id, "label": cell.label, "settings": cell.settings, "budget_steps": cell.budget_steps}
+                      for cell in manifest.cells],
+        })  # fmt: skip
+        return
+    _print_cells(manifest, found)
+    say(
+        f"{len(manifest.cells)} cells x {len(manifest.seeds)} seeds = {len(found)} runs, {made.steps:,} environment "
+        f"steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
+    )
+    other = sum(standing.other_code for standing in done)
+    say(f"done already: {len(done)} runs" + (f", {other} of them by another version of this package" if other else ""))
+    if made.dropped_runs:
+        say(f"{made.dropped_runs} runs of the grid as it was frozen before are no longer in it; their folders are kept")
+    say(f"frozen in {made.grid.folder}")
+
+
+@grid_app.command("run")
+def grid_run(
+    grid: GridPath,
+    root: Root = None,
+    max_parallel: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
+    ] = None,
+    address: Annotated[
+        str, typer.Option(help="local: a private Ray on this machine; auto: the Ray cluster this process is in.")
+    ] = "local",
+    mode: Annotated[
+        str, typer.Option(help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length.")
+    ] = "auto",
+    part: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Only runs FIRST-LAST of the manifest, counted from 0: the part of a batch system's task."),
+    ] = None,
+) -> None:
+    """Work through a grid: skip what is done, go on with what is not, retry by cause."""
+    chosen = _mode(mode)
+    _prepare(address)
+    place, manifest = frozen(grid, _root(root))
+    found = run_frozen(place, manifest, address=address, mode=chosen, max_parallel=max_parallel, part=part)
+    raise typer.Exit(tell(manifest, place, found))
+
+
+@grid_app.command("submit")
+def grid_submit(
+    grid: GridPath,
+    address: Annotated[str, typer.Option(help="The cluster's job server, like http://127.0.0.1:8265.")],
+    root: Root = None,
+    max_in_flight: Annotated[
+        str, typer.Option(help="Runs at a time: auto (as many as there are CPUs for), or a number.")
+    ] = "auto",
+    mode: Annotated[
+        str, typer.Option(help="pool (workers that stay warm), jobs (a Ray job a run), auto: by expected length.")
+    ] = "auto",
+    detach: Annotated[bool, typer.Option("--detach", help="Return once it is submitted.")] = False,
+    py_modules: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option("--py-module", help="A package of your own (environment, policy) that the cluster lacks."),
+    ] = None,
+    python: Annotated[str, typer.Option(help="The cluster's Python that has space_dist.")] = "python",
+) -> None:
+    """Submit a grid to a Ray cluster. Submitted twice, it still runs once."""
+    STOP.install()
+    from space_dist.ray_jobs import Remote
+
+    chosen = _mode(mode)
+    limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
+    base = _root(root)
+    place, manifest = frozen(grid, base)
+    remote = Remote(address, manifest, base)
+    job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
+    say(f"{manifest.name}: conducted by job {job} at {address}")
+    if detach:
+        say(f"`space-dist grid status {place.folder}` tells how far it is, `grid submit` again looks on")
+        return
+    code = remote.follow(job, say, STOP.reason)
+    found = _standings(place, manifest)
+    if not any(standing.attempts or standing.steps for standing in found):
+        warn(
+            f"{place.folder} shows no run of it: it is not on the cluster's storage. What is seen from here is "
+            "limited to what the conductor said above"
+        )
+        raise typer.Exit(code)
+    raise typer.Exit(tell(manifest, place, found))
+
+
+@grid_app.command("status")
+def grid_status(
+    grid: GridPath,
+    root: Root = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on showing until nothing is left to do.")] = False,
+    as_json: Json = False,
+    by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
+    address: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="The cluster's job server, where its storage is not seen from here."),
+    ] = None,
+) -> None:
+    """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
+    from space_dist.manifest import find_grid
+    from space_dist.standing import exit_code
+
+    place = find_grid(grid, _root(root))
+    manifest = place.manifest()
+    if address is not None:
+        raise typer.Exit(_remote_status(place, manifest, address))
+    while True:
+        found = _standings(place, manifest)
+        if as_json:
+            _print_json(_status_json(manifest, place, found))
+        else:
+            if watch and console.is_terminal:
+                console.clear()
+            _print_cells(manifest, found)
+            _print_failures(found, by_cause)
+            say(_summary(manifest, found) + ("" if place.owner_alive() else "; nobody is working on it now"))
+        if not watch or all(standing.condition in ("done", "failed") for standing in found):
+            raise typer.Exit(exit_code(found))
+        time.sleep(_WATCH_SECONDS)
+
+
+@grid_app.command("logs")
+def grid_logs(
+    grid: GridPath,
+    cell: Annotated[str, typer.Argument(help="A cell's label, or the start of its id.")],
+    seed: Seed,
+    root: Root = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Go on until the run has ended.")] = False,
+) -> None:
+    """What one run has said."""
+    from space_dist.manifest import find_grid
+    from space_dist.supervisor import OUTPUT
+
+    place = find_grid(grid, _root(root))
+    manifest = place.manifest()
+    run = manifest.run(cell, seed)
+    ledger = place.ledger(run)
+    offsets = {ledger.log: 0, ledger.folder / OUTPUT: 0}
+    while True:
+        [standing] = _standings(place, manifest, [run])
+        for path in offsets:
+            offsets[path] = _print_from(path, offsets[path])
+        if not follow or standing.condition in ("done", "failed"):
+            break
+        time.sleep(_WATCH_SECONDS)
+    warn(f"{run.title}: {standing.in_words}, {standing.steps:,} of {standing.budget_steps:,} steps. {ledger.folder}")
+    if standing.detail and standing.condition != "done":
+        warn(standing.detail)
+
+
+@grid_app.command("stop")
+def grid_stop(
+    grid: GridPath,
+    root: Root = None,
+    address: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="The cluster's job server, where its storage is not seen from here."),
+    ] = None,
+) -> None:
+    """Have all runs make a checkpoint and end. Running or submitting the grid again goes on from there."""
+    from space_dist.manifest import find_grid
+
+    place = find_grid(grid, _root(root))
+    manifest = place.manifest()
+    if address is not None:
+        from space_dist.ray_jobs import Remote
+
+        remote = Remote(address, manifest, place.folder.parent)
+        conductor = remote.conductor()
+        if conductor is None:
+            raise SpaceDistError(f"{address} knows no conductor of {manifest.name}")
+        remote.stop(str(conductor.submission_id))
+        say(f"{manifest.name}: job {conductor.submission_id} was asked to stop its runs, and itself")
+        return
+    live = [standing for standing in _standings(place, manifest) if standing.condition == "running"]
+    if not live and not place.owner_alive():
+        say(f"{manifest.name}: nothing is running")
+        return
+    place.stop_file.touch()
+    for standing in live:  # those nobody conducts any more, too
+        standing.ledger.stop_file.touch()
+    say(f"{manifest.name}: {len(live)} runs were asked to make a checkpoint and end")
+
+
+@grid_app.command("retry")
+def grid_retry(
+    grid: GridPath,
+    cause: Annotated[list[str], typer.Option("--cause", help="Causes of failures to try again; repeatable.")],
+    root: Root = None,
+) -> None:
+    """Let failed runs be tried again, whatever the grid's `retry` says; they go on from their checkpoints."""
+    from space_dist.manifest import find_grid
+    from space_dist.standing import Attempts, Cause
+
+    known = [one.value for one in Cause]
+    causes = {name.strip().replace("-", "_") for text in cause for name in text.split(",")}
+    for name in causes - {*known}:
+        raise ConfigError(f"--cause {name!r} is not known{nearest(name, known)} Allowed: {', '.join(known)}")
+    place = find_grid(grid, _root(root))
+    manifest = place.manifest()
+    chosen = [standing for standing in _standings(place, manifest)
+              if standing.condition == "failed" and standing.cause in causes]  # fmt: skip
+    for standing in chosen:
+        Attempts(standing.ledger).forgive()
+        say(f"{standing.run.title}: {standing.in_words}; it will be tried again")
+    follow_up = "" if not chosen else f"; `space-dist grid run {place.folder}` or `grid submit` does it"
+    say(f"{len(chosen)} runs may be tried again{follow_up}")
+
+
+@grid_app.command("work", hidden=True)
+def grid_work(
+    folder: Path,
+    cell: str,
+    seed: Seed,
+    attempt: Annotated[int, typer.Option(min=1)],
+    nonce: Annotated[str, typer.Option()],
+    job: Annotated[str, typer.Option()],
+) -> None:
+    """One attempt of one run, as a job of its own."""
+    STOP.install()
+    from space_dist.launch import lasting
+    from space_dist.ray_pool import refuse_other_folder
+    from space_dist.standing import Cause
+    from space_dist.supervisor import Busy, Supervisor, Task, preload
+
+    refuse_other_folder(lasting(folder, "the grid's folder"), nonce)
+    preload()
+    stop_file = folder / "stop"
+
+    def stop_requested() -> Cause | None:
+        if STOP.reason() is None:
+            return None
+        return Cause.STOPPED if stop_file.exists() else Cause.PREEMPTED
+
+    task = Task(str(folder), cell, seed, attempt, "auto", {"job": job})
+    ended = Supervisor().attempt(task, stop_requested)
+    if isinstance(ended, Busy) or ended.cause is None:
+        return
+    warn(f"space-dist: {ended.cause.in_words}: {ended.detail}")
+    resumable = (Cause.STOPPED, Cause.PREEMPTED, Cause.TIMEOUT)
+    raise typer.Exit(75 if ended.cause in resumable else 2 if ended.cause is Cause.CONFIG_ERROR else 1)
+
+
+def run_frozen(
+    place: Grid, manifest: Manifest, *, address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
+    part: str | None = None,
+) -> list[Standing]:  # fmt: skip
+    """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
+    _prepare(address)
+    from space_dist.grid import working_on
+    from space_dist.ray_jobs import conduct
+
+    runs = _part(manifest.runs(), part)
+    _log_to(place)
+    with contextlib.ExitStack() as stack:
+        if part is None:
+            stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
+        observe = stack.enter_context(_display(manifest, place))
+        return conduct(
+            place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel,
+            stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,
+        )  # fmt: skip
+
+
+# ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def _prepare(address: str) -> None:
+    """What must come before Ray, and anything else that is heavy, is imported."""
+    STOP.install()
+    if address == "local":
+        from space_dist.launch import private_ray
+
+        private_ray()
+
+
+def _root(root: Path | None) -> Path:
+    from space_dist.launch import lasting, workplace
+
+    return workplace() / "runs" if root is None else lasting(root, "--root")
+
+
+def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
+    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
+    from space_dist.grid import adopt, plan
+    from space_dist.manifest import MANIFEST, find_grid
+
+    if path.is_dir() or path.name == MANIFEST:
+        source = find_grid(path, root)
+        place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
+        return place, place.manifest()
+    made = plan(path, root)
+    return made.grid, made.manifest
+
+
+def _mode(text: str) -> Mode:
+    if text in ("auto", "pool", "jobs"):
+        return cast("Mode", text)
+    raise ConfigError(f"--mode {text!r} is not known{nearest(text, _MODES)} Allowed: {', '.join(_MODES)}")
+
+
+def _number(text: str, option: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
+        raise ConfigError(f"{option} {text!r}: write auto, or a whole number from 1 to 10000")
+    return int(text)
+
+
+def _part(runs: list[Run], part: str | None) -> list[Run]:
+    if part is None:
+        return runs
+    first, dash, last = part.partition("-")
+    if not (dash and first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
+        raise ConfigError(f"--part {part!r}: write FIRST-LAST, like 0-3")
+    if int(first) >= len(runs):
+        raise ConfigError(f"--part {part}: the grid has {len(runs)} runs, counted from 0")
+    return runs[int(first) : int(last) + 1]
+
+
+def _standings(place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None) -> list[Standing]:
+    from space_dist.provenance import code_digest
+    from space_dist.standing import standings
+
+    return standings(place, manifest, code_digest(), runs)
+
+
+def _log_to(place: Grid) -> None:
+    log = logging.getLogger("space_dist")
+    log.setLevel(logging.INFO)
+    with contextlib.suppress(OSError):
+        handler = logging.FileHandler(place.log)
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        log.addHandler(handler)
+
+
+@contextlib.contextmanager
+def _display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], None]]:
+    """On a terminal a table of what runs now; elsewhere a line now and then."""
+    if console.is_terminal:
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda overview: live.update(_live_table(manifest, place, overview))
+        return
+    told_at = 0.0
+    told: tuple[object, ...] = ()
+
+    def observe(overview: Overview) -> None:
+        nonlocal told_at, told
+        line = (
+            f"{manifest.name}: {overview.done} of {overview.total} done, {len(overview.running)} running, "
+            f"{overview.waiting} waiting, {overview.failed} failed"
+        )
+        if overview.message:
+            line += f" (last: {overview.message})"
+        news = (overview.done, overview.failed, overview.message)
+        if time.monotonic() - told_at > _LOG_SECONDS or news != told:
+            told_at, told = time.monotonic(), news
+            say(line)
+
+    yield observe
+
+
+def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
+    from space_dist.ledger import CURRICULUM
+
+    table = Table(box=None, pad_edge=False, show_header=False)
+    done = overview.done / max(1, overview.total)
+    bar = "█" * round(24 * done) + "░" * (24 - round(24 * done))
+    counts = f"{overview.done} of {overview.total} runs done"
+    counts += f", {overview.failed} failed" if overview.failed else ""
+    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting"))
+    for run in overview.running[:_SHOWN_RUNS]:
+        ledger, line = place.ledger(run), "starting"
+        with contextlib.suppress(SpaceDistError, KeyError, IndexError):
+            rows = ledger.rows(CURRICULUM)
+            evaluations = [row for row in ledger.rows() if row["kind"] == "evaluation"]
+            shown = f"{evaluations[-1]['test']['return']:.1f}" if evaluations else "—"
+            steps = rows[-1]["steps"] if rows else 0
+            size = len(rows[-1]["trained"]) if rows else 0
+            line = f"{steps:>10,} of {run.cell.budget_steps:,} steps   set {size}   test return {shown}"
+        table.add_row(Text(run.title), Text(line))
+    if len(overview.running) > _SHOWN_RUNS:
+        table.add_row("", Text(f"and {len(overview.running) - _SHOWN_RUNS} more"))
+    if overview.message:
+        table.add_row(Text("last", style="red"), Text(overview.message))
+    return table
+
+
+def _print_cells(manifest: Manifest, found: Sequence[Standing]) -> None:
+    """One line for each cell: how its seeds stand."""
+    table = Table(title=Text(manifest.name), title_justify="left")
+    for column in ("cell", "id", "done", "running", "waiting", "failed", "steps"):
+        table.add_column(column, justify="left" if column in ("cell", "id") else "right")
+    of_cell: dict[str, list[Standing]] = {cell.id: [] for cell in manifest.cells}
+    for standing in found:
+        of_cell[standing.run.cell.id].append(standing)
+    for cell in manifest.cells:
+        counts = Counter(standing.condition for standing in of_cell[cell.id])
+        steps = sum(standing.steps for standing in of_cell[cell.id])
+        of_all = sum(standing.budget_steps for standing in of_cell[cell.id])
+        table.add_row(
+            Text(cell.label), cell.id, f"{counts['done']}/{len(of_cell[cell.id])}",
+            *(str(counts[condition]) if counts[condition] else "" for condition in ("running", "waiting", "failed")),
+            f"{steps / max(1, of_all):.0%} of {of_all:,}",
+        )  # fmt: skip
+    console.print(table)
+
+
+def _print_failures(found: Sequence[Standing], by_cause: bool) -> None:
+    unwell = [standing for standing in found if standing.cause is not None and standing.condition != "done"]
+    if by_cause:
+        for cause, count in sorted(Counter(standing.cause for standing in unwell if standing.cause).items()):
+            say(f"{cause.in_words}: {count}")
+            for standing in unwell:
+                if standing.cause is cause:
+                    say(f"  {standing.run.title} ({standing.run.cell.id}): {standing.condition}; {_last(standing)}")
+        return
+    for standing in unwell[:_SHOWN_RUNS]:
+        say(f"{standing.run.title}: {standing.in_words}; {_last(standing)}")
+    if len(unwell) > _SHOWN_RUNS:
+        say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
+
+
+def _last(standing: Standing) -> str:
+    lines = standing.detail.splitlines()
+    return lines[0][:300] if lines else "no more is known"
+
+
+def _summary(manifest: Manifest, found: Sequence[Standing]) -> str:
+    counts = Counter(standing.condition for standing in found)
+    parts = [f"{counts[condition]} {condition}" for condition in ("running", "waiting", "failed") if counts[condition]]
+    other = sum(standing.other_code for standing in found)
+    parts += [f"{other} of the done ones by another version of this package"] if other else []
+    return ", ".join([f"{manifest.name}: {counts['done']} of {len(found)} runs done", *parts])
+
+
+def tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
+    """Say how a grid ended; returns the exit code."""
+    from space_dist.standing import exit_code
+
+    _print_failures(found, by_cause=False)
+    say(f"{_summary(manifest, found)}. {place.folder}")
+    return exit_code(found)
+
+
+def _status_json(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> dict[str, Any]:
+    return {
+        "grid": manifest.name, "folder": str(place.folder), "owner_alive": place.owner_alive(),
+        "counts": dict(Counter(standing.condition for standing in found)),
+        "runs": [
+            {
+                "cell": standing.run.cell.id, "label": standing.run.cell.label, "seed": standing.run.seed,
+                "condition": standing.condition, "cause": standing.cause, "detail": standing.detail,
+                "steps": standing.steps, "budget_steps": standing.budget_steps, "attempts": standing.attempts,
+                "other_code": standing.other_code, "folder": str(standing.ledger.folder),
+            }
+            for standing in found
+        ],
+    }  # fmt: skip
+
+
+def _remote_status(place: Grid, manifest: Manifest, address: str) -> int:
+    """What the job server knows, where the ledgers are not seen from here."""
+    from space_dist.ray_jobs import Remote
+
+    remote = Remote(address, manifest, place.folder.parent)
+    conductor = remote.conductor()
+    if conductor is None:
+        raise SpaceDistError(f"{address} knows no conductor of {manifest.name}")
+    lines = [line for line in remote.logs(str(conductor.submission_id)).splitlines() if line.strip()]
+    say(f"job {conductor.submission_id}: {conductor.status.value.lower()}")
+    for line in lines[-5:]:
+        say(line)
+    warn("this is all that the job server tells; the runs' own files are on the cluster's storage")
+    if conductor.status.value in ("PENDING", "RUNNING"):
+        return _UNFINISHED
+    return conductor.driver_exit_code or 0
+
+
+def _print_json(data: dict[str, Any]) -> None:
+    print(json.dumps(data, indent=1))
+
+
+def _print_from(path: Path, offset: int) -> int:
+    """Print what a growing file holds from `offset` on; returns its new end."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        file.seek(offset)
+        text = file.read()
+        if text:
+            print(text.decode(errors="replace"), end="", flush=True)
+        return offset + len(text)
+    return offset

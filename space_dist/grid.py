@@ -1,0 +1,393 @@
+"""Grids: a YAML file becomes a manifest, a manifest becomes finished runs.
+
+`plan` resolves and checks every cell and freezes the manifest. `conduct` is the one loop that works on a grid, wherever
+its runs are computed: an `Executor` starts them and says how they ended. Finished runs are skipped, unfinished ones go
+on from their checkpoints, failed ones are tried again as the grid's `retry` allows. One conductor at a time works on a
+grid; another waits, and takes over when the first is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import logging
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from space_dist import config as configs
+from space_dist.config import RunConfig
+from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
+from space_dist.instances import InstanceSet
+from space_dist.launch import about, absolute_uri, read_instances
+from space_dist.ledger import Lock
+from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, Run, label_of, load_grid
+from space_dist.provenance import code_digest, git_state, source_digest
+from space_dist.standing import Attempts, Cause, Ended, Standing, may_retry, standing_of, standings
+from space_dist.training import make_env, make_setup, total_steps
+
+log = logging.getLogger("space_dist")
+
+STOP_ASKED = "the grid's file `stop`"
+_TICK_SECONDS = 0.2
+_ELSEWHERE_SECONDS = 2.0
+_FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run is tried again; doubled each time
+_FINAL_PUSH_SECONDS = 300.0
+
+
+# ---- from a file to a manifest --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A frozen grid, and how it differs from what was frozen in its folder before. steps: of all runs together."""
+
+    grid: Grid
+    manifest: Manifest
+    steps: int
+    new_runs: int
+    dropped_runs: int
+
+
+def plan(path: Path, root: Path) -> Plan:
+    """Resolve and check a grid file, and freeze it in `<root>/<name>`.
+
+    A grid that was frozen before is frozen anew: runs of cells that are still there keep their results. Raises
+    ConfigError for every fault of the files, and if somebody is working on another version of the grid now.
+    """
+    config, points = load_grid(path)
+    grid = Grid(root.absolute() / config.name)
+    files = _InstanceFiles()
+    cells: dict[str, Cell] = {}
+    steps = 0
+    for point, data in points:
+        label = label_of(point, config.axes())
+        cell, run_steps = _cell(config, point, label, data, f"{path}, cell {label!r}", files)
+        if cell.id in cells:
+            raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
+        cells[cell.id] = cell
+        steps += run_steps * len(config.seed_list())
+    manifest = Manifest(
+        name=config.name, axes=tuple(config.axes()), cells=_distinct(cells.values()), seeds=config.seed_list(),
+        resources=config.resources, retry=config.retry,
+        tracking=config.tracking.model_copy(update={"uri": absolute_uri(config.tracking.uri)}),
+        baseline=_baseline(path, config, list(cells.values())),
+        instances={name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.contents.items())},
+        code=code_digest(), git=git_state(),
+    )  # fmt: skip
+    before = _freeze(grid, manifest, files.contents)
+    now, then = ({run.key for run in one.runs()} if one else set[str]() for one in (manifest, before))
+    return Plan(grid, grid.manifest(), steps, len(now - then), len(then - now))
+
+
+def adopt(source: Grid, root: Path) -> Grid:
+    """The same frozen grid below another root: what was exported is run where there is room."""
+    manifest = source.manifest()
+    grid = Grid(root.absolute() / manifest.name)
+    if grid.folder.resolve() != source.folder.resolve():
+        _freeze(grid, manifest, source.instance_files(manifest))
+    return grid
+
+
+def _freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
+    """Returns the manifest that was there before."""
+    before = None
+    if grid.manifest_file.exists():
+        with contextlib.suppress(LedgerError):  # a damaged one is replaced
+            before = grid.manifest()
+    if before is not None:
+        same = dataclasses.replace(manifest, code=before.code, git=before.git) == before
+        if same:
+            with contextlib.suppress(LedgerError):
+                grid.instance_files(before)
+                return before
+        elif grid.owner_alive():
+            raise ConfigError(
+                f"{grid.folder} holds another version of this grid, and somebody is working on it now; "
+                f"`space-dist grid stop {grid.folder}` ends that"
+            )
+    grid.freeze(manifest, files)
+    return before
+
+
+class _InstanceFiles:
+    """Instance sets of all cells: each file read once, each set stored once, named by its content."""
+
+    def __init__(self) -> None:
+        self.contents: dict[str, bytes] = {}
+        self._read: dict[tuple[object, ...], tuple[InstanceSet, InstanceSet]] = {}
+        self._names: dict[int, str] = {}
+
+    def sets(self, config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
+        bounds = make_env(config).context_bounds
+        key = (config.instances.train, config.instances.test, bounds)
+        if key not in self._read:
+            self._read[key] = read_instances(config)
+        return self._read[key]
+
+    def name(self, instances: InstanceSet) -> str:
+        if id(instances) not in self._names:  # `_read` keeps them all alive
+            name = f"{instances.digest()[:16]}.csv"
+            self.contents[name] = instances.to_csv().encode()
+            self._names[id(instances)] = name
+        return self._names[id(instances)]
+
+
+def _cell(
+    grid: GridConfig, point: dict[str, Any], label: str, data: dict[str, Any], where: str, files: _InstanceFiles
+) -> tuple[Cell, int]:
+    """A cell, and the environment steps of each of its runs."""
+    for key in ("tracking", "resources", "seed"):  # the grid's own
+        data.pop(key, None)
+    name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
+    config = configs.parse({**data, "name": name}, where)
+    with about(where):
+        train, test = files.sets(config)
+        make_setup(config, train, test)
+        paths = [path for path in (config.env.id, getattr(config.learner, "policy", "")) if ":" in path]
+        sources = {path: source_digest(path) for path in paths}
+    identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
+    resolved = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
+    resolved["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
+                             (("train", train), ("test", test))}  # fmt: skip
+    steps = total_steps(config, make_env(config).horizon)
+    return Cell(identity[:CELL_ID_DIGITS], label, point, resolved), steps
+
+
+def _distinct(cells: Any) -> tuple[Cell, ...]:
+    """Labels that were cut to the same words get the start of the id."""
+    found = list(cells)
+    labels = [cell.label for cell in found]
+    return tuple(
+        cell if labels.count(cell.label) == 1 else dataclasses.replace(cell, label=f"{cell.label} {cell.id[:6]}")
+        for cell in found
+    )
+
+
+def _baseline(path: Path, config: GridConfig, cells: Sequence[Cell]) -> str:
+    if config.baseline:
+        found = [cell for cell in cells
+                 if all(cell.settings[key] == value for key, value in config.baseline.items())]  # fmt: skip
+        if len(found) != 1:
+            raise ConfigError(f"{path}: baseline: {len(found)} cells have these settings; it must be exactly one")
+        return found[0].id
+    round_robin = [cell for cell in cells if cell.config["curriculum"]["kind"] == "round_robin"]
+    return (round_robin or list(cells))[0].id
+
+
+# ---- from a manifest to finished runs -------------------------------------------------------------------------------
+
+
+class Executor(Protocol):
+    """Where runs are computed. No call blocks for longer than a moment."""
+
+    def room(self) -> int:
+        """How many more runs can be started now and will not have to wait."""
+
+    def start(self, run: Run, attempt: int) -> None:
+        """Begin an attempt. Raises SpaceDistError if the place itself is gone."""
+
+    def poll(self) -> list[tuple[Run, Ended | None]]:
+        """Attempts that have ended since, and how; None where somebody else works on the run."""
+
+    def stop(self) -> None:
+        """Ask every live attempt to checkpoint and end."""
+
+    def adopt(self, runs: Sequence[Run]) -> list[Run]:
+        """Those of `runs` that an earlier conductor has started here and that still live; they are polled from now."""
+
+
+@dataclass
+class Overview:
+    """What a display shows."""
+
+    total: int
+    done: int = 0
+    failed: int = 0
+    waiting: int = 0
+    running: list[Run] = field(default_factory=list)
+    message: str = ""
+
+
+class Conductor:
+    """Works through the runs of a grid. `conduct` returns where they all stand in the end."""
+
+    def __init__(
+        self, grid: Grid, manifest: Manifest, runs: Sequence[Run], executor: Executor,
+        *, stop_requested: Callable[[], str | None], observe: Callable[[Overview], None] = lambda overview: None,
+    ) -> None:  # fmt: skip
+        self._grid, self._manifest, self._runs, self._executor = grid, manifest, runs, executor
+        self._stop_requested, self._observe = stop_requested, observe
+        self._waiting: list[tuple[float, Run]] = []  # not before that time, by the monotonic clock
+        self._live: dict[str, Run] = {}
+        self._elsewhere: dict[str, Run] = {}
+        self._overview = Overview(len(runs))
+
+    def conduct(self) -> list[Standing]:
+        """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
+        self._begin()
+        looked = time.monotonic()
+        while self._waiting or self._live or self._elsewhere:
+            for run, ended in self._executor.poll():
+                self._settle(run, ended)
+            if reason := self._asked_to_stop():
+                self._wind_up(reason)
+            self._start_what_fits()
+            if self._elsewhere and time.monotonic() - looked > _ELSEWHERE_SECONDS:
+                looked = time.monotonic()
+                for run in list(self._elsewhere.values()):
+                    self._place(run)
+            self._show()
+            time.sleep(_TICK_SECONDS)
+        self._show()
+        return self.standings()
+
+    def standings(self) -> list[Standing]:
+        """Where all runs stand now, by their files."""
+        return standings(self._grid, self._manifest, code_digest(), self._runs)
+
+    def _begin(self) -> None:
+        self._grid.stop_file.unlink(missing_ok=True)
+        adopted = {run.key for run in self._executor.adopt(self._runs)}
+        for run in self._runs:
+            if run.key in adopted:
+                self._live[run.key] = run
+            else:
+                self._place(run)
+
+    def _place(self, run: Run, delay: float = 0.0) -> None:
+        """Put a run where its files say it belongs."""
+        self._elsewhere.pop(run.key, None)
+        standing = standing_of(run, self._grid.ledger(run), self._manifest.retry, code_digest())
+        if standing.condition == "running":
+            self._elsewhere[run.key] = run
+        elif standing.condition == "waiting":
+            self._waiting.append((time.monotonic() + delay, run))
+        elif standing.condition == "failed":
+            self._overview.failed += 1
+            log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
+        else:
+            self._overview.done += 1
+
+    def _start_what_fits(self) -> None:
+        room, now = self._executor.room(), time.monotonic()
+        for entry in list(self._waiting):
+            if room <= 0:
+                break
+            if entry[0] > now:
+                continue
+            run, ledger = entry[1], self._grid.ledger(entry[1])
+            attempts = Attempts(ledger)
+            history = attempts.history()
+            if history.begun and history.last is None and not ledger.owner_alive():
+                # Nobody wrote how it ended: its supervisor is gone, too.
+                attempts.end(history.begun, Ended(Cause.KILLED, "not heard of again"))
+            self._waiting.remove(entry)
+            self._executor.start(run, history.begun + 1)
+            self._live[run.key] = run
+            room -= 1
+
+    def _settle(self, run: Run, ended: Ended | None) -> None:
+        self._live.pop(run.key, None)
+        if ended is None:
+            self._elsewhere[run.key] = run
+            return
+        if ended.cause is None:
+            self._overview.done += 1
+            log.info("%s: done", run.title)
+            return
+        history = Attempts(self._grid.ledger(run)).history()
+        again = may_retry(ended.cause, history.ends, self._manifest.retry)
+        log.warning("%s: %s%s: %s", run.title, ended.cause.in_words, ", trying again" if again else "", ended.detail)
+        self._overview.message = f"{run.title}: {ended.cause.in_words}"
+        self._place(run, min(_MAX_DELAY, _FIRST_DELAY * 2 ** max(0, history.ends.get(ended.cause, 0) - 1)))
+
+    def _asked_to_stop(self) -> str | None:
+        return STOP_ASKED if self._grid.stop_file.exists() else self._stop_requested()
+
+    def _wind_up(self, reason: str) -> None:
+        log.warning("stopping: %s", reason)
+        self._executor.stop()
+        while self._live:
+            for run, _ in self._executor.poll():
+                self._live.pop(run.key, None)
+            self._show()
+            time.sleep(_TICK_SECONDS)
+        raise Interrupted(
+            f"stopped ({reason}); what ran has made a checkpoint, and the same command goes on from there"
+        )
+
+    def _show(self) -> None:
+        overview = self._overview
+        overview.running = list(self._live.values())
+        overview.waiting = len(self._waiting) + len(self._elsewhere)
+        self._observe(overview)
+
+
+@contextlib.contextmanager
+def working_on(
+    grid: Grid, manifest: Manifest, *, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
+) -> Iterator[None]:
+    """Be the only one who works on the grid, once whoever does so now is gone, and keep MLflow's mirror meanwhile.
+
+    `say` hears why it takes time, and of a mirror that could not be brought up to date. Raises Interrupted if asked to
+    stop while waiting, RunLockedError at once if not to `wait`, LedgerError if the folder cannot be written.
+    """
+    lock = _acquired(grid, wait, stop_requested, say)
+    pusher = None
+    try:
+        pusher = _start_pusher(grid, manifest)
+        yield
+    finally:
+        lock.release()  # by which the pusher knows that it may end
+        if pusher is not None and not _ends_well(pusher):
+            say(
+                f"warning: MLflow at {manifest.tracking.uri} could not be brought up to date; nothing is lost: "
+                f"`space-dist sync {grid.folder}` replays the grid (details: {grid.tracking_log})"
+            )
+
+
+def _acquired(
+    grid: Grid, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
+) -> Lock:  # fmt: skip
+    lock, told = Lock(grid.lock_file), False
+    while True:
+        try:
+            lock.acquire()
+        except RunLockedError as error:
+            if not wait:
+                raise
+            if not told:
+                say(f"{error}. This process takes over then.")
+                told = True
+            if reason := stop_requested():
+                raise Interrupted(f"stopped while waiting ({reason})") from None
+            time.sleep(_ELSEWHERE_SECONDS)
+        except OSError as error:
+            raise LedgerError(f"cannot write the grid's folder {grid.folder}: {error.strerror}") from None
+        else:
+            return lock
+
+
+def _start_pusher(grid: Grid, manifest: Manifest) -> subprocess.Popen[bytes] | None:
+    """One process pushes for all runs, so that a store has one writer, and a slow server costs no training time."""
+    if manifest.tracking.uri is None:
+        return None
+    command = [sys.executable, "-m", "space_dist.cli", "sync", "--follow", "--", str(grid.folder)]
+    with grid.tracking_log.open("ab") as output:
+        return subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+        )  # fmt: skip
+
+
+def _ends_well(pusher: subprocess.Popen[bytes]) -> bool:
+    try:
+        return pusher.wait(timeout=_FINAL_PUSH_SECONDS) == 0
+    except subprocess.TimeoutExpired:
+        pusher.terminate()
+        return False

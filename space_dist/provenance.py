@@ -1,0 +1,90 @@
+"""What results depend on besides config and seed: this code, a user's own, the libraries, and the CPU."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import platform
+import subprocess
+from pathlib import Path
+
+from space_dist.errors import ConfigError
+
+_BITS_DEPEND_ON = ("numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "space-dist")
+_MAX_SOURCES = 5_000  # files of a user's package
+_DIGITS = 16
+
+
+def fingerprint() -> dict[str, str]:
+    """What bit-equality is promised for: the CPU's model, and the versions of what computes."""
+    model = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+                break
+    versions = {name: importlib.metadata.version(name) for name in _BITS_DEPEND_ON}
+    return {"cpu": model, "python": platform.python_version(), "code": code_digest(), **versions}
+
+
+@functools.cache
+def code_digest() -> str:
+    """`(16 hex digits)` a hash of this package's own source files, by their paths and content."""
+    return _digest(Path(__file__).resolve().parent)
+
+
+def source_digest(import_path: str) -> str:
+    """`(16 hex digits)` a hash of the source behind `my_package.my_module:name`: all of the user's package.
+
+    A module outside any package counts alone: what it imports from beside it is not seen.
+    Raises ConfigError if there is no such module.
+    """
+    module = import_path.partition(":")[0]
+    top = module.partition(".")[0]
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError) as error:
+        raise ConfigError(f"{import_path!r}: cannot find the module {top!r}: {error}") from None
+    if spec is None:
+        raise ConfigError(f"{import_path!r}: there is no module {top!r}")
+    digest = hashlib.sha256()
+    for folder in spec.submodule_search_locations or ():
+        digest.update(_digest(Path(folder)).encode())
+    if not spec.submodule_search_locations:
+        # A built-in or compiled module has no source: its name, and the libraries' versions, must do.
+        has_source = spec.origin is not None and Path(spec.origin).is_file()
+        digest.update(Path(str(spec.origin)).read_bytes() if has_source else top.encode())
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _digest(folder: Path) -> str:
+    files = sorted(folder.rglob("*.py"))
+    if len(files) > _MAX_SOURCES:
+        raise ConfigError(f"{folder} holds {len(files)} Python files; an environment's package may have {_MAX_SOURCES}")
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:_DIGITS]
+
+
+def git_state() -> dict[str, str]:
+    """The commit this package was checked out at, and whether it was edited since; empty outside a repository."""
+    here = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(here), *arguments], capture_output=True, text=True, timeout=10, check=False  # noqa: S607
+            )  # fmt: skip
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    commit = git("rev-parse", "HEAD")
+    if commit is None or git("ls-files", "--error-unmatch", __file__) is None:
+        return {}
+    return {"git_commit": commit, "git_dirty": str(bool(git("status", "--porcelain", "--", "."))).lower()}

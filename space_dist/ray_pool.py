@@ -1,0 +1,268 @@
+"""Runs of a grid on a warm pool: Ray actors of one CPU, each with a supervisor that keeps its imports from run to run.
+
+The pool lives and dies with its conductor, so it suits runs that are short beside the seconds a process needs to start.
+A worker that dies, or gives no sign of life, is replaced; what it was doing ends with a cause and may be tried again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+import secrets
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_DEDUP_LOGS", "0")
+
+import psutil
+import ray
+from ray.exceptions import RayActorError, RayError
+
+from space_dist.errors import LedgerError, SpaceDistError
+from space_dist.manifest import Grid, Manifest, Run
+from space_dist.standing import Attempts, Cause, Ended
+from space_dist.supervisor import STOPPED_SECONDS, Task
+
+log = logging.getLogger("space_dist")
+
+_SIGN_SECONDS = 2.0
+_LATE_SECONDS = 30.0  # without an answer a worker is taken for lost
+_START_SECONDS = 120.0
+_NONCE = ".nonce-"
+
+
+class PoolWorker:
+    """One CPU's worth of a pool: manages a warm supervisor, a process of its own, on the actor's node."""
+
+    def __init__(self, folder: str, nonce: str) -> None:
+        refuse_other_folder(Path(folder), nonce)
+        self._folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        self._stopped_since: float | None = None
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "space_dist.supervisor"]
+        # Nothing of this actor's own identity: runs that join Ray join it as drivers.
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
+        with (Path(self._folder) / "pool.log").open("ab") as errors:
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
+            )  # fmt: skip
+        self._read(process)
+        return process
+
+    def _read(self, process: subprocess.Popen[bytes]) -> dict[str, Any] | None:
+        """The next line of the supervisor's, None once it is gone."""
+        line = process.stdout.readline() if process.stdout is not None else b""
+        if not line:
+            return None
+        message: dict[str, Any] = json.loads(line)
+        return message
+
+    def attempt(self, task: dict[str, Any]) -> dict[str, Any] | None:
+        """How the attempt ended; None if the supervisor was lost with it."""
+        if self._process is None or self._process.poll() is not None:
+            self._process = self._start()
+        self._send(task)
+        message = self._read(self._process)
+        if message is None:
+            self._process.wait()
+            self._process = None
+        return message
+
+    def _send(self, message: dict[str, Any]) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.write(json.dumps(message).encode() + b"\n")
+                self._process.stdin.flush()
+
+    def stop(self, cause: str) -> None:
+        """Ask the live attempt to checkpoint and end."""
+        self._send({"stop": cause})
+
+    def sign(self) -> str:
+        """A sign of life: the id of the node. Kills a supervisor that somebody has stopped (SIGSTOP) for too long."""
+        process = self._process
+        if process is not None:
+            with contextlib.suppress(psutil.Error):
+                stopped = psutil.Process(process.pid).status() == psutil.STATUS_STOPPED
+                self._stopped_since = (self._stopped_since or time.monotonic()) if stopped else None
+                if self._stopped_since is not None and time.monotonic() - self._stopped_since > STOPPED_SECONDS:
+                    process.kill()
+        node: str = ray.get_runtime_context().get_node_id()
+        return node
+
+
+@dataclass
+class _Slot:
+    """A worker, what it is doing, and when it was last heard of. node: None until it has started."""
+
+    actor: Any
+    hired: float
+    sign: Any
+    node: str | None = None
+    run: Run | None = None
+    attempt: int = 0
+    answer: Any = None
+    heard: float = 0.0
+
+
+class Pool:
+    """An `Executor` on the Ray this process has joined; a context manager that leaves nothing behind.
+
+    `size` workers, of one CPU each, beside the CPUs of the runs' own rollout actors.
+    """
+
+    def __init__(self, grid: Grid, manifest: Manifest, size: int) -> None:
+        self._grid, self._manifest, self._size = grid, manifest, size
+        self._nonce = Nonce(grid)
+        self._address = ray.get_runtime_context().gcs_address
+        self._slots: list[_Slot] = []
+
+    def __enter__(self) -> Pool:
+        self._nonce.place()
+        try:
+            self._slots = [self._hire() for _ in range(self._size)]
+        except BaseException:
+            self._nonce.remove()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for slot in self._slots:
+            with contextlib.suppress(RayError):
+                ray.kill(slot.actor)
+        self._nonce.remove()
+
+    def room(self) -> int:
+        """See `grid.Executor`. A worker that Ray has no CPU for yet is no room."""
+        return sum(slot.run is None and slot.node is not None for slot in self._slots)
+
+    def start(self, run: Run, attempt: int) -> None:
+        """See `grid.Executor`."""
+        slot = next(slot for slot in self._slots if slot.run is None and slot.node is not None)
+        task = Task(str(self._grid.folder), run.cell.id, run.seed, attempt, self._address)
+        slot.run, slot.attempt, slot.heard = run, attempt, time.monotonic()
+        slot.answer = slot.actor.attempt.remote(dataclasses.asdict(task))
+
+    def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a pool does not outlive its conductor
+        """See `grid.Executor`."""
+        return []
+
+    def stop(self) -> None:
+        """See `grid.Executor`."""
+        for slot in self._slots:
+            if slot.run is not None:
+                slot.actor.stop.remote(Cause.STOPPED.value)
+
+    def poll(self) -> list[tuple[Run, Ended | None]]:
+        """See `grid.Executor`."""
+        ended: list[tuple[Run, Ended | None]] = []
+        for index, slot in enumerate(self._slots):
+            run, attempt = slot.run, slot.attempt
+            try:
+                if run is not None and ray.wait([slot.answer], timeout=0)[0]:
+                    message = ray.get(slot.answer)
+                    slot.run = slot.answer = None
+                    ended.append((run, self._understood(run, attempt, message)))
+                else:
+                    self._listen(slot)
+            except RayActorError as error:
+                _refuse_start(error)
+                log.warning("lost a worker of the pool: %s", str(error).splitlines()[0][:200])
+                lost = self._lost(slot)
+                self._slots[index] = self._hire()
+                if run is not None:
+                    Attempts(self._grid.ledger(run)).end(attempt, lost)
+                    ended.append((run, lost))
+        if all(slot.node is None and time.monotonic() - slot.hired > _START_SECONDS for slot in self._slots):
+            raise SpaceDistError(
+                f"Ray did not start a worker of one CPU within {_START_SECONDS:.0f} s; {_cpus()} CPUs are free"
+            )
+        return ended
+
+    def _understood(self, run: Run, attempt: int, message: dict[str, Any] | None) -> Ended | None:
+        if message is None:
+            lost = Ended(Cause.KILLED, "its supervisor was killed")
+            Attempts(self._grid.ledger(run)).end(attempt, lost)
+            return lost
+        if message["busy"]:
+            return None
+        return Ended(None if message["cause"] is None else Cause(message["cause"]), message["detail"])
+
+    def _listen(self, slot: _Slot) -> None:
+        """Ask for a sign of life now and then; whoever gives none for too long is killed, and found dead next time."""
+        now = time.monotonic()
+        if slot.sign is not None and ray.wait([slot.sign], timeout=0)[0]:
+            slot.node = ray.get(slot.sign)
+            slot.sign, slot.heard = None, now
+        elif slot.sign is None and now - slot.heard > _SIGN_SECONDS:
+            slot.sign = slot.actor.sign.remote()
+        if slot.node is not None and now - slot.heard > _SIGN_SECONDS + _LATE_SECONDS:
+            slot.heard = now
+            ray.kill(slot.actor)
+
+    def _lost(self, slot: _Slot) -> Ended:
+        alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
+        if slot.node is not None and slot.node not in alive:
+            return Ended(Cause.NODE_LOST, "the node of its worker is gone")
+        return Ended(Cause.KILLED, "its worker was killed")
+
+    def _hire(self) -> _Slot:
+        # Never restarted by Ray: who hires knows what it was doing.
+        workers = ray.remote(num_cpus=1, max_restarts=0)(PoolWorker).options(max_concurrency=4)
+        actor = workers.remote(str(self._grid.folder), self._nonce.text)
+        return _Slot(actor, hired=time.monotonic(), sign=actor.sign.remote())  # type: ignore[attr-defined]
+
+
+class Nonce:
+    """A file that proves that another process sees the same grid folder."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.text = secrets.token_hex(16)
+        self._path = grid.folder / f"{_NONCE}{self.text}"
+
+    def place(self) -> None:
+        """Raises LedgerError if the folder cannot be written."""
+        try:
+            self._path.touch()
+        except OSError as error:
+            raise LedgerError(f"cannot write the grid's folder {self._path.parent}: {error.strerror}") from None
+
+    def remove(self) -> None:
+        """Whatever happens."""
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+
+def refuse_other_folder(folder: Path, nonce: str) -> None:
+    """Raise LedgerError if the folder here is not the one in which the conductor has placed its nonce."""
+    if not (folder / f"{_NONCE}{nonce}").exists():
+        host = os.uname().nodename
+        raise LedgerError(
+            f"{host} does not see the grid's folder {folder}: its root must be on storage all nodes share"
+        )
+
+
+def _refuse_start(error: RayActorError) -> None:
+    """An actor that could not even start will not do better next time: raise what it said."""
+    text = str(error)
+    if "does not see the grid's folder" in text:
+        raise LedgerError(next(line for line in text.splitlines() if "does not see" in line).partition("Error: ")[2])
+
+
+def _cpus() -> str:
+    free: dict[str, float] = ray.available_resources()  # type: ignore[no-untyped-call]
+    return f"{free.get('CPU', 0.0):g}"

@@ -1,0 +1,247 @@
+"""Where every run of a grid stands, from its own files alone: any terminal, today or tomorrow, sees the same.
+
+Beside a run's ledger lies `attempts.jsonl`: a row when an attempt begins, one when it has ended and why, one when a
+user asks for another try. Whoever supervises the run writes them. One that dies leaves a beginning without an end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from space_dist.errors import LedgerError
+from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, this_process
+from space_dist.manifest import Grid, Manifest, Retry, Run
+
+ATTEMPTS = "attempts.jsonl"
+MAX_DETAIL = 4000  # characters
+_MAX_BYTES = 16 << 20
+
+
+class Cause(StrEnum):
+    """Why an attempt ended before its run was done."""
+
+    CONFIG_ERROR = "config_error"
+    OUT_OF_MEMORY = "out_of_memory"
+    PREEMPTED = "preempted"
+    NODE_LOST = "node_lost"
+    TIMEOUT = "timeout"
+    CRASH = "crash"
+    KILLED = "killed"
+    STOPPED = "stopped"  # on the user's own request; not a failure
+
+    @property
+    def in_words(self) -> str:
+        """For people."""
+        return _WORDS[self]
+
+
+_WORDS = {
+    Cause.CONFIG_ERROR: "config error",
+    Cause.OUT_OF_MEMORY: "out of memory",
+    Cause.PREEMPTED: "preempted",
+    Cause.NODE_LOST: "node lost",
+    Cause.TIMEOUT: "timeout",
+    Cause.CRASH: "crash",
+    Cause.KILLED: "killed by an unknown hand",
+    Cause.STOPPED: "stopped",
+}
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How an attempt ended. cause: None where its run is done. detail: one or more lines for people."""
+
+    cause: Cause | None
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class History:
+    """The attempts of a run.
+
+    begun: how many began. last: how the last one ended; None if it has not, as far as is known.
+    ends: how often each cause ended one, since a user last asked for another try. where: of the last attempt.
+    """
+
+    begun: int = 0
+    last: Ended | None = None
+    ends: Mapping[Cause, int] = field(default_factory=dict)
+    where: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Attempts:
+    """The history of one run: append-only, read whole. A row torn by a kill or a full disk is skipped."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.path = ledger.folder / ATTEMPTS
+
+    def begin(self, attempt: int, where: Mapping[str, Any]) -> None:
+        """Attempt number `attempt` (from 1) begins in this process; `where` adds to what is known of it (a job)."""
+        self._append({"event": "begin", "attempt": attempt, "where": {**this_process(), **where}})
+
+    def end(self, attempt: int, ended: Ended) -> None:
+        """It has ended."""
+        self._append({"event": "end", "attempt": attempt, "cause": ended.cause, "detail": ended.detail[-MAX_DETAIL:]})
+
+    def sign(self) -> None:
+        """A sign of life of the supervisor: the file's time."""
+        with contextlib.suppress(OSError):
+            os.utime(self.path)
+
+    def forgive(self) -> None:
+        """A user asks for another try: earlier ends no longer count."""
+        self._append({"event": "retry"})
+
+    def _append(self, row: Row) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a+b") as file:
+                line = encode_row({**row, "unix_time": time.time()})
+                size = file.seek(0, os.SEEK_END)
+                if size:
+                    file.seek(size - 1)
+                    if file.read(1) != b"\n":  # what was torn stays a line of its own
+                        line = b"\n" + line
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise LedgerError(f"cannot write {self.path}: {error.strerror}") from None
+
+    def rows(self) -> list[Row]:
+        """Every intact row."""
+        try:
+            with self.path.open("rb") as file:
+                content = file.read(_MAX_BYTES)
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        except OSError as error:
+            raise LedgerError(f"{self.path} cannot be read: {error.strerror}") from None
+        return [row for line in content.splitlines(keepends=True) if (row := decode_row(line)) is not None]
+
+    def last_sign(self) -> float:
+        """When a supervisor last gave one, in seconds since the epoch."""
+        with contextlib.suppress(OSError):
+            return self.path.stat().st_mtime
+        return 0.0
+
+    def history(self) -> History:
+        """What the rows say."""
+        begun, last, where = 0, None, dict[str, Any]()
+        ends: Counter[Cause] = Counter()
+        for row in self.rows():
+            with contextlib.suppress(KeyError, ValueError, TypeError):  # rows of a later version
+                if row["event"] == "begin":
+                    begun, last = max(begun, int(row["attempt"])), None
+                    where = {**row["where"], "heartbeat": max(row["unix_time"], self.last_sign())}
+                elif row["event"] == "end":
+                    begun = max(begun, int(row["attempt"]))
+                    last = Ended(None if row["cause"] is None else Cause(row["cause"]), str(row["detail"]))
+                    if last.cause is not None:
+                        ends[last.cause] += 1
+                elif row["event"] == "retry":
+                    ends.clear()
+                    last = Ended(None)
+        return History(begun, last, ends, where)
+
+
+Condition = Literal["done", "running", "waiting", "failed"]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where one run stands.
+
+    condition: `waiting` runs will be started, or go on, when somebody works on the grid; `failed` ones will not.
+    cause, detail: of the last attempt's end, if it has not been done since.
+    steps, budget_steps: environment steps. attempts: how many began. other_code: done, but by another version of this
+    package than the one here. started_at: of the running attempt, seconds since the epoch.
+    """
+
+    run: Run
+    ledger: Ledger
+    condition: Condition
+    steps: int
+    budget_steps: int
+    attempts: int
+    cause: Cause | None = None
+    detail: str = ""
+    other_code: bool = False
+    fingerprint_changed: bool = False
+
+    @property
+    def in_words(self) -> str:
+        """`failed: out of memory`, `waiting (preempted)`, ..."""
+        if self.cause is None or self.condition in ("done", "running"):
+            return self.condition + (" (by other code)" if self.other_code else "")
+        return f"{self.condition}: {self.cause.in_words}"
+
+
+def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
+    """Where a run stands now. `code` is this package's digest. A damaged ledger is a failed run that says so."""
+    history = Attempts(ledger).history()
+    budget = run.cell.budget_steps
+    try:
+        status = ledger.status() if ledger.status_file.exists() else None
+    except LedgerError as error:
+        return Standing(run, ledger, "failed", 0, budget, history.begun, Cause.CRASH, str(error))
+    steps = status.steps if status is not None else 0
+    if status is not None and status.state == "done":
+        return Standing(
+            run, ledger, "done", steps, budget, history.begun,
+            other_code=status.fingerprint.get("code") != code, fingerprint_changed=status.fingerprint_changed,
+        )  # fmt: skip
+    if status is not None and ledger.owner_alive():
+        return Standing(run, ledger, "running", steps, budget, history.begun)
+    last = history.last
+    if last is None and history.begun and believed_alive(history.where):  # it loads its libraries
+        return Standing(run, ledger, "running", steps, budget, history.begun)
+    if last is None and history.begun:  # its supervisor is gone, and told nobody why
+        host = history.where.get("host", "an unknown host")
+        last = Ended(Cause.KILLED, f"it began on {host} and was not heard of again")
+    if last is None or last.cause is None:
+        return Standing(run, ledger, "waiting", steps, budget, history.begun)
+    condition: Condition = "waiting" if may_retry(last.cause, history.ends, retry) else "failed"
+    return Standing(run, ledger, condition, steps, budget, history.begun, last.cause, last.detail)
+
+
+def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:
+    """Whether a run that ended so may be tried again. `ends` counts the ends by cause, this one included if known."""
+    if cause is Cause.STOPPED:
+        return True
+    allowed = {**retry.model_dump(), Cause.CONFIG_ERROR: 0}
+    return ends.get(cause, 0) <= int(allowed[cause])
+
+
+def standings(grid: Grid, manifest: Manifest, code: str, runs: Sequence[Run] | None = None) -> list[Standing]:
+    """Where every run stands, in the manifest's order (or those of `runs`)."""
+    chosen = manifest.runs() if runs is None else runs
+    return [standing_of(run, grid.ledger(run), manifest.retry, code) for run in chosen]
+
+
+def exit_code(found: Sequence[Standing]) -> int:
+    """0: all done.  1: some have failed.  3: some are not done yet."""
+    conditions = {standing.condition for standing in found}
+    if "failed" in conditions:
+        return 1
+    return 3 if conditions - {"done"} else 0
+
+
+def last_lines(path: Path, count: int = 5, limit: int = 64 << 10) -> list[str]:
+    """The last lines of a text file that may be long, missing, or no text at all."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - limit))
+            text = file.read(limit).decode(errors="replace")
+    except OSError:
+        return []
+    return [line for line in text.splitlines() if line.strip()][-count:]

@@ -1,0 +1,367 @@
+"""One attempt of one run, in a process of its own that is watched: memory, time, stops, and why it ended.
+
+Every place that runs grids (this machine, Ray pool, Ray job, SLURM task) does it through `Supervisor.attempt`. The run
+is a fork of the supervisor, which has imported everything already: it starts in milliseconds, and whatever it does to
+its process (leaks, crashes, global state) ends with it.
+
+`python -m space_dist.supervisor` is a warm supervisor for many runs: a task a line on standard input, the end of each
+a line on standard output. When its input ends, so does it, after its run has made a checkpoint.
+"""
+
+from __future__ import annotations
+
+import os
+
+# ruff: noqa: E402 - one thread for all arithmetic, before any library reads these
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import contextlib
+import ctypes
+import dataclasses
+import json
+import select
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
+from space_dist.interrupts import StopRequests
+from space_dist.manifest import Grid, Manifest, Run, RunResources
+from space_dist.standing import Attempts, Cause, Ended, last_lines
+
+OUTPUT = "output.txt"
+STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
+_LOOK_SECONDS = 0.1
+_SIGN_SECONDS = 5.0
+_KILL_SECONDS = 10.0  # after a run's grace time
+_PDEATHSIG = 1  # prctl's
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to attempt. grid: its folder. address: of the Ray to join. where: more about this place (a job's id)."""
+
+    grid: str
+    cell: str
+    seed: int
+    attempt: int
+    address: str = "local"
+    where: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Busy(Ended):
+    """The attempt was none: another process is working on the run."""
+
+
+class Supervisor:
+    """Forks a process for each attempt and watches it. Must be used from a process without other threads."""
+
+    def __init__(self) -> None:
+        self._manifests: dict[str, tuple[int, Manifest]] = {}
+
+    def attempt(self, task: Task, stop_requested: Callable[[], Cause | None]) -> Ended:
+        """Run `task` until it has ended, and record it. `stop_requested` is asked all the time.
+
+        Raises LedgerError if the grid's folder cannot be read or written.
+        """
+        grid = Grid(task.grid)
+        manifest = self._manifest(grid)
+        run = manifest.run(task.cell, task.seed)
+        ledger = grid.ledger(run)
+        if ledger.owner_alive():
+            return Busy(None, "another process is working on it")
+        attempts = Attempts(ledger)
+        attempts.begin(task.attempt, task.where)
+        out_of_memory_before = _system_kills()
+        child = _Child.fork(lambda: _work(grid, manifest, run, task.address), ledger.folder / OUTPUT)
+        watch = _Watch(child, manifest.resources, attempts)
+        while (code := child.code()) is None:
+            watch.look(stop_requested)
+            time.sleep(_LOOK_SECONDS)
+        child.clean()
+        if child.report().get("error") == RunLockedError.__name__:
+            attempts.end(task.attempt, Ended(Cause.STOPPED, "another process is working on it"))
+            return Busy(None, child.report().get("message", ""))
+        ended = Ended(None)
+        if code:
+            ended = watch.reason or _why(code, child, grid, _system_kills() > out_of_memory_before)
+        if ended.cause in (Cause.CRASH, Cause.CONFIG_ERROR):
+            lines = last_lines(ledger.folder / OUTPUT)
+            ended = Ended(ended.cause, "\n".join([*filter(None, [ended.detail]), *lines][-6:]))
+        attempts.end(task.attempt, ended)
+        return ended
+
+    def _manifest(self, grid: Grid) -> Manifest:
+        """Read once, as long as it does not change: manifests may be large, and runs short."""
+        try:
+            changed = grid.manifest_file.stat().st_mtime_ns
+        except OSError:
+            changed = -1
+        known = self._manifests.get(task_folder := str(grid.folder))
+        if known is None or known[0] != changed:
+            known = self._manifests[task_folder] = (changed, grid.manifest())
+        return known[1]
+
+
+class _Child:
+    """A forked process, its last words through a pipe, and everything below it."""
+
+    def __init__(self, pid: int, pipe: int) -> None:
+        self.pid, self._pipe = pid, pipe
+        self._process = psutil.Process(pid)
+        self._code: int | None = None
+        self._words = b""
+
+    @classmethod
+    def fork(cls, work: Callable[[], None], output: Path) -> _Child:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        parent = os.getpid()
+        reading, writing = os.pipe()
+        pid = os.fork()
+        if pid:
+            os.close(writing)
+            return cls(pid, reading)
+        code = 1
+        try:
+            os.close(reading)
+            os.setsid()
+            ctypes.CDLL(None).prctl(_PDEATHSIG, signal.SIGTERM)
+            if os.getppid() != parent:
+                os._exit(Interrupted.exit_code)
+            code = _child_main(work, output, writing)
+        except BaseException:  # nothing may return into the parent's code
+            traceback.print_exc()
+        finally:
+            with contextlib.suppress(Exception):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(code)
+
+    def code(self) -> int | None:
+        """The exit code, minus the number of the signal that ended it; None while it lives."""
+        if self._code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                self._code = os.waitstatus_to_exitcode(status)
+        return self._code
+
+    def tree(self) -> list[psutil.Process]:
+        with contextlib.suppress(psutil.Error):
+            return [self._process, *self._process.children(recursive=True)]
+        return []
+
+    def signal(self, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            if self._code is None:
+                os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """End it and everything below, at once."""
+        for process in self.tree():
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
+    def clean(self) -> None:
+        """Kill what the run has left in its session, and hear its last words."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+        with contextlib.suppress(OSError):
+            while chunk := os.read(self._pipe, 1 << 16):
+                self._words += chunk
+            os.close(self._pipe)
+
+    def report(self) -> dict[str, str]:
+        """What it said of its error, if anything."""
+        with contextlib.suppress(ValueError):
+            found = json.loads(self._words)
+            return found if isinstance(found, dict) else {}
+        return {}
+
+
+@dataclass
+class _Watch:
+    """Looks after a child, and remembers why it was ended, if it was."""
+
+    child: _Child
+    resources: RunResources
+    attempts: Attempts
+    reason: Ended | None = None
+    began: float = field(default_factory=time.monotonic)
+    kill_at: float | None = None
+    stopped_since: float | None = None
+    last_sign: float = 0.0
+
+    def look(self, stop_requested: Callable[[], Cause | None]) -> None:
+        now = time.monotonic()
+        if now - self.last_sign > _SIGN_SECONDS:
+            self.last_sign = now
+            self.attempts.sign()
+        used, state = self._used()
+        limit = self.resources.memory_mb
+        if limit is not None and used > limit << 20:
+            self._end(Ended(Cause.OUT_OF_MEMORY, f"its processes used {used >> 20} MB; memory_mb is {limit}"))
+        self.stopped_since = (self.stopped_since or now) if state == psutil.STATUS_STOPPED else None
+        if self.stopped_since is not None and now - self.stopped_since > STOPPED_SECONDS:
+            self._end(Ended(Cause.KILLED, f"it was stopped by a signal (SIGSTOP) for {STOPPED_SECONDS:.0f} s"))
+        if self.kill_at is None:
+            minutes, asked = self.resources.minutes, stop_requested()
+            if asked is not None:
+                self._ask(Ended(asked))
+            elif minutes is not None and now - self.began > 60.0 * minutes:
+                self._ask(Ended(Cause.TIMEOUT, f"it took longer than {minutes:g} minutes"))
+        elif now > self.kill_at:
+            self.child.kill()
+
+    def _used(self) -> tuple[int, str]:
+        """RSS of the child's processes in bytes, and the child's state."""
+        used, state = 0, ""
+        for process in self.child.tree():
+            with contextlib.suppress(psutil.Error):
+                used += process.memory_info().rss
+                state = state or process.status()
+        return used, state
+
+    def _ask(self, reason: Ended) -> None:
+        self.reason = reason
+        self.kill_at = time.monotonic() + self.resources.grace_seconds + _KILL_SECONDS
+        self.child.signal(signal.SIGTERM)
+
+    def _end(self, reason: Ended) -> None:
+        self.reason = self.reason or reason
+        self.child.kill()
+
+
+def _why(code: int, child: _Child, grid: Grid, system_killed: bool) -> Ended:
+    """Why a child ended that nobody here ended."""
+    said = child.report()
+    message = said.get("message", "")
+    if code == Interrupted.exit_code:
+        return Ended(Cause.STOPPED if grid.stop_file.exists() else Cause.PREEMPTED, message)
+    if code == ConfigError.exit_code:
+        return Ended(Cause.CONFIG_ERROR, message)
+    if said.get("error") == MemoryError.__name__ or (code == -signal.SIGKILL and system_killed):
+        return Ended(Cause.OUT_OF_MEMORY, message or "the system had no memory left, and killed it")
+    if code == -signal.SIGKILL:
+        return Ended(Cause.KILLED, "SIGKILL")
+    if code < 0:
+        return Ended(Cause.CRASH, f"ended by {signal.Signals(-code).name}")
+    return Ended(Cause.CRASH, message or f"exit code {code}")
+
+
+def _system_kills() -> int:
+    """How often the kernel has killed a process of our control group for want of memory."""
+    total = 0
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/self/cgroup").read_text().splitlines():
+            folder = Path("/sys/fs/cgroup") / line.split(":", 2)[2].lstrip("/")
+            for events in {folder / "memory.events", Path("/sys/fs/cgroup/memory.events")}:
+                with contextlib.suppress(OSError):
+                    counts = dict(entry.split() for entry in events.read_text().splitlines())
+                    total += int(counts.get("oom_kill", 0))
+    return total
+
+
+# ---- in the child ---------------------------------------------------------------------------------------------------
+
+
+def _child_main(work: Callable[[], None], output: Path, pipe: int) -> int:
+    """The exit code; an error's sentence goes to the output and through the pipe."""
+    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    try:
+        work()
+    except SpaceDistError as error:
+        print(f"space-dist: {error}", file=sys.stderr)
+        kind = MemoryError if isinstance(error.__cause__, MemoryError) else type(error)
+        os.write(pipe, json.dumps({"error": kind.__name__, "message": str(error)[:4000]}).encode())
+        return error.exit_code
+    return 0
+
+
+def _work(grid: Grid, manifest: Manifest, run: Run, address: str) -> None:
+    from space_dist.launch import launch
+
+    stop = StopRequests()
+    stop.install()
+    launch(grid.run_config(manifest, run, address=address), grid.ledger(run).folder, resume=True, stop=stop)
+
+
+# ---- as a process of its own ----------------------------------------------------------------------------------------
+
+
+class _Manager:
+    """Whoever sends tasks through standard input."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._asked: Cause | None = None
+        self.gone = False
+
+    def tasks(self) -> Iterator[Task]:
+        while not self.gone:
+            message = self._next(None)
+            if message is not None and "stop" not in message:
+                self._asked = None
+                yield Task(**message)
+
+    def stop_requested(self) -> Cause | None:
+        message = self._next(0.0)
+        if message is not None:
+            self._asked = Cause(message["stop"])
+        return self._asked or (Cause.PREEMPTED if self.gone else None)
+
+    def _next(self, seconds: float | None) -> dict[str, Any] | None:
+        if b"\n" not in self._buffer:
+            if self.gone or not select.select([0], [], [], seconds)[0]:
+                return None
+            chunk = os.read(0, 1 << 16)
+            self.gone = not chunk
+            self._buffer += chunk
+        line, newline, rest = self._buffer.partition(b"\n")
+        if not newline:
+            return None
+        self._buffer = rest
+        message: dict[str, Any] = json.loads(line)
+        return message
+
+
+def main() -> None:
+    """Attempt every task that comes, one after another."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever manages us
+    sys.path.append(str(Path.cwd()))  # import paths in configs may name the user's own modules
+    results = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is not a result
+    preload()
+    supervisor, manager = Supervisor(), _Manager()
+    print(json.dumps({"ready": os.getpid()}), file=results, flush=True)
+    for task in manager.tasks():
+        try:
+            ended = supervisor.attempt(task, manager.stop_requested)
+        except (LedgerError, ConfigError) as error:
+            ended = Ended(Cause.CONFIG_ERROR if isinstance(error, ConfigError) else Cause.CRASH, str(error))
+        print(json.dumps({"busy": isinstance(ended, Busy), **dataclasses.asdict(ended)}), file=results, flush=True)
+
+
+def preload() -> None:
+    """Import what every run needs, so that forks need not. Starts no thread."""
+    import space_dist.launch  # noqa: F401
+    from space_dist import learner
+
+    learner.preload()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,629 @@
+"""One run into one MLflow store: what of a run is to be mirrored, and the calls that bring it there.
+
+`space_dist.synced_rows` says how many rows of metrics.jsonl are there. That tag is written after the rows it counts:
+what dies in between pushes some points again, and MLflow keeps a point of the same (key, time, step, value) once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+from space_dist.errors import ConfigError, LedgerError, SpaceDistError
+from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Metric
+    from mlflow.entities import Run as MlflowRun
+
+    from space_dist.report.load import Run as LoadedRun
+
+log = logging.getLogger("space_dist.tracking")
+
+RUN_TAG: Final = "space_dist.run"
+ROWS_TAG: Final = "space_dist.synced_rows"
+ARTIFACTS_TAG: Final = "space_dist.artifacts"
+GRID_TAG: Final = "space_dist.grid_key"
+STARTED_TAG: Final = "space_dist.started"
+STAMP_TAG: Final = "space_dist.stamp"
+TABLE_TAG: Final = "space_dist.results"
+NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
+
+_MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
+_MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
+_PAGE: Final = 200  # runs with all their data in one answer
+_DATABASE_WAIT_SECONDS: Final = 20.0
+_DRAW_SECONDS: Final = 60.0  # for the pictures of a run
+_ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
+# MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
+_ENVIRONMENT: Final = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",  # seconds
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
+}
+
+
+class TrackingError(SpaceDistError):
+    """MLflow cannot be reached or does not take what it is sent. The ledgers are untouched."""
+
+
+# ---- a run's side ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a run is to MLflow as a part of a grid.
+
+    key: `(32 hex digits)` of grid, cell and seed. title: the child's name. remark: the end of its description.
+    tags: more of them, the parent's id among them. ending: how it stands in MLflow's words. ended_at: seconds since
+    the epoch. stamp: changes whenever anything that is pushed does; a child that has it is up to date.
+    shows_episodes: whether its policy is drawn when it is done: drawing takes seconds, so one seed of a cell is enough.
+    """
+
+    key: str
+    title: str
+    remark: str
+    tags: Mapping[str, str]
+    ending: str
+    ended_at: float
+    stamp: str
+    shows_episodes: bool
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What of a run is to be mirrored, read before MLflow is asked anything."""
+
+    ledger: Ledger
+    status: Status
+    alive: bool
+    config: Mapping[str, Any]
+    rows: Sequence[Row]
+    timing: Sequence[Row]
+    note: str  # Markdown: what the run is, where it stands, and how it did
+    part: Part | None = None
+
+    @property
+    def key(self) -> str:
+        """`(32 hex digits)`: this run and no other. Outside grids, also when another one starts in its folder."""
+        if self.part is not None:
+            return self.part.key
+        return key_of(str(self.ledger.folder.resolve()), repr(self.status.started_at))
+
+    @property
+    def title(self) -> str:
+        """What the run is called in MLflow."""
+        return self.part.title if self.part is not None else f"{self.status.name}-s{self.status.seed}"
+
+    @property
+    def mlflow_status(self) -> str:
+        """RUNNING, FINISHED, FAILED or KILLED."""
+        if self.part is not None:
+            return self.part.ending
+        if self.status.state == "running":
+            return "RUNNING" if self.alive else "KILLED"
+        return {"done": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}[self.status.state]
+
+    @property
+    def ended_at(self) -> float:
+        """Seconds since the epoch."""
+        return self.part.ended_at if self.part is not None else self.status.updated_at
+
+
+def key_of(*parts: str) -> str:
+    """`(32 hex digits)` by which something is found again."""
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+
+
+def read_snapshot(
+    ledger: Ledger, status: Status, alive: bool, config: Mapping[str, Any], part: Part | None = None
+) -> Snapshot:
+    """What of a run is to be mirrored now. Raises LedgerError if its files are damaged."""
+    try:
+        rows = ledger.rows(METRICS, committed_only=True)
+        timing = ledger.rows(TIMING, committed_only=True)  # after the rows: it has one for each of them by now
+    except OSError as error:
+        raise LedgerError(f"{error.filename} cannot be read: {error.strerror}") from None
+    if len(timing) < len(rows):
+        raise LedgerError(f"{ledger.folder / TIMING} has {len(timing)} rows where {METRICS} has {len(rows)}")
+    try:
+        note = describe_run(ledger, status, config, rows)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LedgerError(f"{ledger.folder / METRICS} has rows that this version cannot read: {error!r}") from None
+    if part is not None:
+        note += f"\n\n{part.remark}"
+    return Snapshot(ledger, status, alive, config, rows, timing, note, part)
+
+
+def _numbers(row: Row) -> Iterator[tuple[str, float]]:
+    """(metric name, value) of each number of a row; per-instance lists, nulls and words are none."""
+    sections = ("train", "test") if row["kind"] == "evaluation" else ("rollout", "learner", "curriculum")
+    for section in sections:
+        for name, value in row[section].items():
+            if isinstance(value, int | float):
+                yield f"{section}/{name}", float(value)
+    if row["kind"] == "iteration":
+        for name, value in row.items():
+            if isinstance(value, int | float) and name not in ("steps", "complete"):
+                yield name, float(value)
+
+
+def _metrics(snapshot: Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
+    """(rows complete once this is pushed, metric) from row `start` on, each row's own time and real step."""
+    from mlflow.entities import Metric
+
+    for index in range(start, len(snapshot.rows)):
+        row, timing = snapshot.rows[index], snapshot.timing[index]
+        try:
+            milliseconds, steps, numbers = round(timing["unix_time"] * 1000), int(row["steps"]), list(_numbers(row))
+            rate = timing["steps_per_second"]
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise LedgerError(f"{snapshot.ledger.folder / METRICS}, row {index + 1}: {error!r}") from None
+        if rate is not None:
+            numbers.append(("timing/steps_per_second", float(rate)))
+        for position, (name, value) in enumerate(numbers):
+            yield index + (position + 1 == len(numbers)), Metric(name, value, milliseconds, steps)
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """`section.key` -> text; lists as JSON."""
+    flat: dict[str, str] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            text = value if isinstance(value, str) else json.dumps(value, default=str)
+            flat[f"{prefix}{key}"[:_MAX_KEY]] = text[:_MAX_PARAM]
+    return flat
+
+
+def _tags(snapshot: Snapshot) -> dict[str, str]:
+    status = snapshot.status
+    tags = {
+        "space_dist.seed": str(status.seed),
+        "space_dist.name": status.name,
+        "space_dist.state": status.state,
+        STARTED_TAG: repr(status.started_at),
+        "space_dist.folder": str(snapshot.ledger.folder),
+        "space_dist.fingerprint_changed": str(status.fingerprint_changed).lower(),
+        **{f"space_dist.fingerprint.{key}": str(value) for key, value in status.fingerprint.items()},
+        NOTE_TAG: snapshot.note,
+        **(snapshot.part.tags if snapshot.part is not None else {}),
+    }
+    return {key: value[:MAX_TAG] for key, value in tags.items()}
+
+
+def describe_run(ledger: Ledger, status: Status, config: Mapping[str, Any], rows: Sequence[Row]) -> str:
+    flat = flatten(config)
+    what = " · ".join(flat[key] for key in ("curriculum.kind", "learner.kind", "env.id") if key in flat)
+    lines = [
+        f"**{status.name}**, seed {status.seed}: {what}",
+        "",
+        f"- {status.state}, {status.steps:,} of {status.budget_steps:,} environment steps",
+    ]
+    if status.message:
+        lines.append(f"- {status.message.splitlines()[0][:500]}")
+    evaluations = [row for row in rows if row["kind"] == "evaluation"]
+    if evaluations:
+        last = evaluations[-1]
+        when = "at the end" if status.state == "done" else f"at {last['steps']:,} steps"
+        lines += [f"- {split} return {when}: {_shown(last[split]['return'])}, success {_shown(last[split]['success'])}"
+                  for split in ("test", "train")]  # fmt: skip
+    lines.append(f"- folder `{ledger.folder}`")
+    return "\n".join(lines)
+
+
+def _shown(value: float | None) -> str:
+    return "—" if value is None else f"{value:.4g}"
+
+
+# ---- MLflow's side --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Child:
+    """What is known of a grid's run in MLflow."""
+
+    run_id: str
+    stamp: str
+    ending: str
+
+
+@dataclass(frozen=True)
+class Parent:
+    """A grid as a run of its own.
+
+    key: `(32 hex digits)` by which it is found. tags: its description among them. table: results that are too long for
+    the description, in Markdown. Times are seconds since the epoch.
+    """
+
+    key: str
+    name: str
+    tags: Mapping[str, str]
+    table: str | None
+    ending: str
+    started_at: float
+    ended_at: float
+
+
+class RefusedError(Exception):
+    """MLflow was reached and does not take this one run's content."""
+
+
+class Store:
+    """One MLflow store. Methods raise TrackingError if it cannot be reached, RefusedError for one bad run."""
+
+    def __init__(self, uri: str) -> None:
+        self._uri = uri
+        self._experiments: dict[str, str] = {}
+        self._artifact_location: str | None = None  # the server's choice
+        if uri.startswith("sqlite:"):
+            database = _database(uri)
+            self._artifact_location = (database.parent / "mlartifacts").as_uri()
+            self._client = _open_database(uri, database)
+        else:
+            self._client = _new_client(uri)
+
+    @contextlib.contextmanager
+    def exclusively(self, lock_file: Path | None = None) -> Iterator[None]:
+        """Be the only one that pushes: into an SQLite store, and of all who take `lock_file`. Waits for others.
+
+        Whoever dies lets go at once. What is found or not found meanwhile stays so.
+        """
+        with contextlib.ExitStack() as held:
+            if lock_file is not None:
+                held.enter_context(_locked(lock_file))
+            if self._uri.startswith("sqlite:"):
+                database = _database(self._uri)
+                held.enter_context(_locked(database.parent / f".{database.name}.pusher"))
+            yield
+
+    def push(
+        self, snapshot: Snapshot, experiment: str, run_id: str | None = None, *, known_new: bool = False
+    ) -> tuple[str, bool, int]:
+        """(id of the run there, whether it is new, rows pushed).
+
+        run_id: what it was when last seen. known_new: it need not be searched for.
+        """
+        with store_errors(self._uri):
+            run, created = self._find_or_create(snapshot, self._experiment_id(experiment), run_id, known_new)
+            self._push_params(run, snapshot)
+            pushed = self._push_rows(run, snapshot)
+            self._push_standing(run, snapshot)
+            if snapshot.ledger.exists():  # of some attempts nothing is left but why they failed
+                self._push_artifacts(run, snapshot)
+            if snapshot.part is not None and run.data.tags.get(STAMP_TAG) != snapshot.part.stamp:
+                self._client.set_tag(run.info.run_id, STAMP_TAG, snapshot.part.stamp)  # last: all else is there
+            return str(run.info.run_id), created, pushed
+
+    def children(self, experiment: str, grid_key: str) -> dict[str, Child]:
+        """The runs of a grid that are there, by their key. Takes milliseconds for each, so it is asked once."""
+        found: dict[str, Child] = {}
+        with store_errors(self._uri):
+            experiment_id, page = self._experiment_id(experiment), None
+            while True:
+                runs = self._client.search_runs(
+                    [experiment_id], f"tags.`{GRID_TAG}` = '{grid_key}'", max_results=_PAGE, page_token=page
+                )
+                for run in runs:
+                    tags = run.data.tags
+                    child = Child(str(run.info.run_id), tags.get(STAMP_TAG, ""), str(run.info.status))
+                    key = tags.get(RUN_TAG, "")
+                    found[key] = min(child, found.get(key, child), key=lambda one: one.run_id)
+                page = runs.token
+                if not page:
+                    return found
+
+    def find_parent(self, key: str, experiment: str) -> str | None:
+        """The id of a grid's own run, if it is there."""
+        with store_errors(self._uri):
+            found = self._client.search_runs([self._experiment_id(experiment)], f"tags.`{RUN_TAG}` = '{key}'")
+            return min((str(run.info.run_id) for run in found), default=None)
+
+    def create_parent(self, parent: Parent, experiment: str) -> str:
+        """The id of a grid's own run, which is not there yet."""
+        with store_errors(self._uri):
+            tags = {RUN_TAG: parent.key, **parent.tags}
+            start = round(parent.started_at * 1000)
+            run = self._client.create_run(
+                self._experiment_id(experiment), start_time=start, tags=tags, run_name=parent.name
+            )
+            return str(run.info.run_id)
+
+    def push_parent(self, parent: Parent, run_id: str) -> None:
+        """Bring a grid's own run up to date."""
+        from mlflow.entities import RunTag
+
+        with store_errors(self._uri):
+            run = self._client.get_run(run_id)
+            changed = [RunTag(key, value) for key, value in parent.tags.items() if run.data.tags.get(key) != value]
+            for start in range(0, len(changed), _MAX_TAGS):
+                self._client.log_batch(run_id, tags=changed[start : start + _MAX_TAGS])
+            table = key_of(parent.table or "")
+            if parent.table is not None and run.data.tags.get(TABLE_TAG) != table:
+                self._client.log_text(run_id, parent.table, "results.md")
+                self._client.set_tag(run_id, TABLE_TAG, table)
+            self._push_ending(run, parent.ending, parent.ended_at)
+
+    def _experiment_id(self, name: str) -> str:
+        from mlflow.exceptions import MlflowException
+
+        if name in self._experiments:
+            return self._experiments[name]
+        found = self._client.get_experiment_by_name(name)
+        if found is None:
+            try:
+                identity = self._client.create_experiment(name, artifact_location=self._artifact_location)
+            except MlflowException as error:
+                if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                    raise
+                found = self._client.get_experiment_by_name(name)  # another pusher was faster
+                if found is None:
+                    raise
+        if found is not None:
+            if found.lifecycle_stage != "active":
+                raise ConfigError(
+                    f"the MLflow experiment {name!r} at {self._uri} was deleted; restore it there, or choose another "
+                    "name (tracking.experiment)"
+                )
+            identity = str(found.experiment_id)
+        self._experiments[name] = identity
+        return identity
+
+    def _find_or_create(
+        self, snapshot: Snapshot, experiment_id: str, run_id: str | None, known_new: bool
+    ) -> tuple[MlflowRun, bool]:
+        found = [] if run_id is None else [self._client.get_run(run_id)]
+        found = [run for run in found if run.info.lifecycle_stage == "active"]
+        if not found and not known_new:
+            found = self._client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{snapshot.key}'")
+        if found:
+            run = min(found, key=lambda run: str(run.info.run_id))
+            if snapshot.part is None or not self._superseded(run, snapshot):
+                return run, False
+            self._client.delete_run(run.info.run_id)  # into MLflow's trash; points cannot be taken back singly
+        status = snapshot.status
+        run = self._client.create_run(
+            experiment_id,
+            start_time=round(status.started_at * 1000),
+            tags={RUN_TAG: snapshot.key, **_tags(snapshot)},
+            run_name=snapshot.title,
+        )
+        return run, True
+
+    @staticmethod
+    def _superseded(run: MlflowRun, snapshot: Snapshot) -> bool:
+        """Whether points are there of another run in the same folder, which was removed to start afresh."""
+        there = run.data.tags.get(ROWS_TAG, "0") != "0"
+        return there and run.data.tags.get(STARTED_TAG) != _tags(snapshot)[STARTED_TAG]
+
+    def _push_params(self, run: MlflowRun, snapshot: Snapshot) -> None:
+        """Those that are not there yet: a param never changes, and a batch that was cut off is completed."""
+        from mlflow.entities import Param
+
+        missing = [Param(key, value) for key, value in flatten(snapshot.config).items() if key not in run.data.params]
+        for start in range(0, len(missing), _MAX_PARAMS):
+            self._client.log_batch(run.info.run_id, params=missing[start : start + _MAX_PARAMS])
+
+    def _push_rows(self, run: MlflowRun, snapshot: Snapshot) -> int:
+        from mlflow.entities import RunTag
+
+        there = _whole_number(run.data.tags.get(ROWS_TAG, "0"))
+        batch: list[Metric] = []
+
+        def send(rows: int) -> None:
+            # Two calls: within one, MLflow promises no order between metrics and tags.
+            self._client.log_batch(run.info.run_id, metrics=batch)
+            self._client.log_batch(run.info.run_id, tags=[RunTag(ROWS_TAG, str(rows))])
+            batch.clear()
+
+        complete = there
+        for complete, metric in _metrics(snapshot, there):
+            batch.append(metric)
+            if len(batch) == _MAX_METRICS:
+                send(complete)
+        if batch:
+            send(complete)
+        return complete - there
+
+    def _push_artifacts(self, run: MlflowRun, snapshot: Snapshot) -> None:
+        """The config at once; all that makes a run reusable and readable when it is done."""
+        ledger, before = snapshot.ledger, run.data.tags.get(ARTIFACTS_TAG)
+        wanted = "done" if snapshot.status.state == "done" else "config"
+        if before in (wanted, "done"):
+            return
+        files = [ledger.config]
+        if wanted == "done":
+            files += [ledger.instances("train"), ledger.instances("test"), ledger.model_arrays,
+                      ledger.model_description, ledger.folder / METRICS]  # fmt: skip
+            files += [ledger.log] if ledger.log.exists() else []
+            if missing := [file.name for file in files if not file.exists()]:
+                raise LedgerError(f"{ledger.folder} is done but has no {', '.join(missing)}")
+            with tempfile.TemporaryDirectory() as folder:
+                episodes = snapshot.part is None or snapshot.part.shows_episodes
+                for figure in _draw(ledger, Path(folder), episodes=episodes):
+                    self._client.log_artifact(run.info.run_id, str(figure), "figures")
+        for file in files:
+            ledger.read(file)  # is it what the run wrote?
+            self._client.log_artifact(run.info.run_id, str(file))
+        self._client.set_tag(run.info.run_id, ARTIFACTS_TAG, wanted)
+
+    def _push_standing(self, run: MlflowRun, snapshot: Snapshot) -> None:
+        """Tags and status, after the rows: nothing may look finished before its numbers are there."""
+        from mlflow.entities import RunTag
+
+        changed = [RunTag(key, value) for key, value in _tags(snapshot).items() if run.data.tags.get(key) != value]
+        for start in range(0, len(changed), _MAX_TAGS):
+            self._client.log_batch(run.info.run_id, tags=changed[start : start + _MAX_TAGS])
+        self._push_ending(run, snapshot.mlflow_status, snapshot.ended_at)
+
+    def _push_ending(self, run: MlflowRun, wanted: str, ended_at: float) -> None:
+        end = round(ended_at * 1000)
+        if wanted == "RUNNING":
+            if run.info.status != wanted:
+                self._client.update_run(run.info.run_id, status=wanted)
+        elif (run.info.status, run.info.end_time) != (wanted, end):
+            self._client.set_terminated(run.info.run_id, wanted, end_time=end)
+
+
+def _draw(ledger: Ledger, folder: Path, *, episodes: bool) -> list[Path]:
+    """Figures of a finished run in `folder`; with `episodes`, what its policy does, too."""
+    from space_dist.report import draw_curriculum, draw_learning_curve, load_run, save
+
+    run = load_run(ledger)
+    figures = {}
+    if len(run.evaluation_steps):
+        figures["learning_curve.png"] = draw_learning_curve(run)
+    if len(run.set_sizes):
+        figures["curriculum.png"] = draw_curriculum(run)
+    for name, figure in figures.items():
+        save(figure, folder / name)
+    return [folder / name for name in figures] + (_draw_episodes(run, folder / "episodes") if episodes else [])
+
+
+def _draw_episodes(run: LoadedRun, folder: Path) -> list[Path]:
+    """What the policy does, in GIFs and PNGs, for our own environments and policies that act without torch.
+
+    In a process of its own, which can be ended when it takes too long; a failure costs a warning.
+    """
+    ledger = run.ledger
+    try:
+        env_id = str(run.config["env"]["id"])
+        policy = json.loads(ledger.model_description.read_bytes())["policy"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []  # nothing that acts
+    if policy == "torch" or not env_id.startswith("space_dist/"):
+        return []
+    command = [sys.executable, "-m", "space_dist.cli", "render", "--out", str(folder), "--", str(ledger.folder)]
+    try:
+        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_DRAW_SECONDS, check=True)
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip()
+        log.warning("%s: its episodes were not drawn: %s", ledger.folder, said[:300])
+    except (subprocess.TimeoutExpired, OSError) as error:
+        log.warning("%s: its episodes were not drawn: %s", ledger.folder, error)
+    return sorted([*folder.glob("*.gif"), *folder.glob("*.png")])  # whole ones, also of a process that was ended
+
+
+def _whole_number(text: str) -> int:
+    """A tag that people can edit; anything but a count means that nothing is known to be there."""
+    return int(text) if re.fullmatch(r"[0-9]{1,15}", text) else 0
+
+
+def checked_uri(uri: str) -> str:
+    """The URI, with an absolute path if it is SQLite's. Raises ConfigError for a store that is not mirrored to."""
+    try:
+        parts = urlsplit(uri)
+        host, has_credentials = parts.hostname, "@" in parts.netloc
+    except ValueError:
+        raise ConfigError(f"the tracking URI {uri!r} is not a URI; {_ALLOWED}") from None
+    if parts.scheme in ("http", "https") and host:
+        if has_credentials:
+            raise ConfigError(
+                f"the tracking URI for {host} contains credentials, which would be stored with every run; give them in "
+                "the environment: MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
+            )
+        return uri.rstrip("/")
+    if parts.scheme == "sqlite":
+        return f"sqlite:///{_database(uri)}"
+    if parts.scheme in ("", "file"):
+        raise ConfigError(f"the tracking URI {uri!r} is a folder of files, which MLflow no longer supports; {_ALLOWED}")
+    raise ConfigError(f"a tracking URI of the kind {parts.scheme}: cannot be mirrored to; {_ALLOWED}")
+
+
+def _database(uri: str) -> Path:
+    name = uri.removeprefix("sqlite:///")
+    if name == uri or not name or name == ":memory:" or "?" in name:
+        raise ConfigError(f"the tracking URI {uri!r} names no database file; {_ALLOWED}")
+    return Path(name).absolute()
+
+
+def _new_client(uri: str) -> MlflowClient:
+    from mlflow import MlflowClient
+
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)  # a line a retry; we say it once
+    return MlflowClient(tracking_uri=uri, registry_uri=uri)
+
+
+def _open_database(uri: str, database: Path) -> MlflowClient:
+    """A client whose tables exist. Creating them is no transaction: two pushers at once would break each other."""
+    database.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(database.parent / f".{database.name}.lock", os.O_RDWR | os.O_CREAT, 0o644)
+    with os.fdopen(descriptor) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        # MLflow would try for minutes to open a file that it can never write to.
+        with contextlib.closing(sqlite3.connect(database, timeout=_DATABASE_WAIT_SECONDS)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.rollback()
+        client = _new_client(uri)
+        client.get_experiment_by_name("Default")
+    return client
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file's lock, which the system takes back from whoever dies. Raises TrackingError if it cannot be had."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise TrackingError(f"cannot write {path}, by which pushers take turns: {error.strerror}") from None
+    with os.fdopen(descriptor) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            log.warning("waiting for another process that pushes at this moment (%s)", path)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:
+            raise TrackingError(f"cannot lock {path}, by which pushers take turns: {error.strerror}") from None
+        yield
+
+
+@contextlib.contextmanager
+def store_errors(uri: str) -> Iterator[None]:
+    """Run MLflow, and say what went wrong in our words. Raises TrackingError and RefusedError."""
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)  # MLflow reads some of them when it is imported: next
+    import requests
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except MlflowException as error:
+        if error.error_code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST"):
+            raise RefusedError(f"MLflow at {uri} refuses it: {_first_line(error)}") from error
+        raise _unreachable(uri, error) from error
+    except (SQLAlchemyError, sqlite3.Error, requests.RequestException, OSError) as error:
+        raise _unreachable(uri, error) from error
+
+
+def _unreachable(uri: str, error: Exception) -> TrackingError:
+    return TrackingError(
+        f"MLflow at {uri} cannot be written to: {_first_line(error)}. Nothing is lost: the ledgers are complete, and "
+        "`space-dist sync` replays them once it works again"
+    )
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip() or type(error).__name__
+    line = text.splitlines()[0]
+    return f"{line[:200]}…" if len(line) > 200 else line.rstrip(".")
