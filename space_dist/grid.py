@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import fcntl
 import hashlib
 import logging
 import subprocess
@@ -95,7 +96,17 @@ def adopt(source: Grid, root: Path) -> Grid:
 
 
 def _freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
-    """Returns the manifest that was there before."""
+    """Returns the manifest that was there before. Tasks of a batch system may all do this at once."""
+    try:
+        grid.folder.mkdir(parents=True, exist_ok=True)
+        with (grid.folder / ".freezing").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return _freeze_alone(grid, manifest, files)
+    except OSError as error:
+        raise LedgerError(f"cannot write the grid's folder {grid.folder}: {error.strerror}") from None
+
+
+def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
     before = None
     if grid.manifest_file.exists():
         with contextlib.suppress(LedgerError):  # a damaged one is replaced
@@ -252,7 +263,6 @@ class Conductor:
         return standings(self._grid, self._manifest, code_digest(), self._runs)
 
     def _begin(self) -> None:
-        self._grid.stop_file.unlink(missing_ok=True)
         adopted = {run.key for run in self._executor.adopt(self._runs)}
         for run in self._runs:
             if run.key in adopted:
@@ -341,6 +351,7 @@ def working_on(
     lock = _acquired(grid, wait, stop_requested, say)
     pusher = None
     try:
+        grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
         pusher = _start_pusher(grid, manifest)
         yield
     finally:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from space_dist.grid import Overview
     from space_dist.manifest import Grid, Manifest, Run
     from space_dist.ray_jobs import Mode
+    from space_dist.slurm.queue import Queue
     from space_dist.standing import Standing
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
@@ -96,6 +97,15 @@ def grid_run(
         Optional[str],  # noqa: UP045
         typer.Option(help="Only runs FIRST-LAST of the manifest, counted from 0: the part of a batch system's task."),
     ] = None,
+    nodes: Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")] = 1,
+    stop_file: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Stop, as on a signal, once this file exists: how a batch system's script passes one on."),
+    ] = None,
+    digest: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--runs", help="Refuse a manifest whose runs have another digest than this one."),
+    ] = None,
 ) -> None:
     """Work through a grid: skip what is done, go on with what is not, retry by cause."""
     STOP.install()
@@ -108,14 +118,21 @@ def grid_run(
 
     chosen = _mode(mode)
     place, manifest = _frozen(grid, _root(root))
+    if digest is not None and digest != manifest.runs_digest:
+        raise ConfigError(
+            f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
+            "export the grid again, and submit that"
+        )
     runs = _part(manifest.runs(), part)
+    if stop_file is not None:
+        STOP.watch(stop_file, manifest.resources.grace_seconds)
     _log_to(place)
     with contextlib.ExitStack() as stack:
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
         observe = stack.enter_context(_display(manifest, place))
         found = conduct(
-            place, manifest, runs, address=address, mode=chosen, max_parallel=max_parallel,
+            place, manifest, runs, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes,
             stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,
         )  # fmt: skip
     raise typer.Exit(_tell(manifest, place, found))
@@ -178,6 +195,7 @@ def grid_status(
 ) -> None:
     """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
     from space_dist.manifest import find_grid
+    from space_dist.slurm.queue import queue_of
     from space_dist.standing import exit_code
 
     place = find_grid(grid, _root(root))
@@ -185,15 +203,15 @@ def grid_status(
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
     while True:
-        found = _standings(place, manifest)
+        found, queue = _standings(place, manifest), queue_of(place.folder)
         if as_json:
-            _print_json(_status_json(manifest, place, found))
+            _print_json(_status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
             if watch and console.is_terminal:
                 console.clear()
             _print_cells(manifest, found)
             _print_failures(found, by_cause)
-            say(_summary(manifest, found) + ("" if place.owner_alive() else "; nobody is working on it now"))
+            say(_summary(manifest, found) + _workers_in_words(place, queue))
         if not watch or all(standing.condition in ("done", "failed") for standing in found):
             raise typer.Exit(exit_code(found))
         time.sleep(_WATCH_SECONDS)
@@ -480,6 +498,12 @@ def _summary(manifest: Manifest, found: Sequence[Standing]) -> str:
     other = sum(standing.other_code for standing in found)
     parts += [f"{other} of the done ones by another version of this package"] if other else []
     return ", ".join([f"{manifest.name}: {counts['done']} of {len(found)} runs done", *parts])
+
+
+def _workers_in_words(place: Grid, queue: Queue | None) -> str:
+    if queue is not None:
+        return f"\n{queue.in_words()}"
+    return "" if place.owner_alive() else "; nobody is working on it now"
 
 
 def _tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
