@@ -25,7 +25,6 @@ from space_dist.errors import SpaceDistError, nearest
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _OBJECT_STORE_BYTES = 256 << 20
-_RAY_SECONDS = 3.0  # for Ray to end by itself
 _LINGER_SECONDS = 20.0  # for runs to make a checkpoint, once their Ray is gone
 _TRIES, _TRY_SECONDS = 60, 2.0  # for the head's port to open
 _LOOK_SECONDS = 0.1
@@ -73,34 +72,40 @@ def serve(head: str, port: int, *, cpus: int, temp: Path, interface: str | None)
     own = address_facing(head, interface)
     shutil.rmtree(temp, ignore_errors=True)  # of this job before it was requeued
     try:
-        temp.mkdir(mode=0o700)
+        temp.mkdir(mode=0o700)  # Ray opens its own folder to all
     except OSError as error:
         raise SpaceDistError(f"{socket.gethostname()} cannot make {temp}: {error.strerror}") from None
-    options = [
-        f"--node-ip-address={own}", f"--num-cpus={cpus}", f"--object-store-memory={_OBJECT_STORE_BYTES}",
-        f"--temp-dir={temp}", "--min-worker-port=0", "--max-worker-port=0", "--disable-usage-stats", "--block",
-        f"--dashboard-agent-listen-port={port + 1}", "--include-log-monitor=false",
-    ]  # fmt: skip
-    if own == head:
-        options += ["--head", f"--port={port}", "--include-dashboard=false", f"--ray-client-server-port={port + 2}"]
-    else:
-        _await_port(head, port, asked)
-        options += [f"--address={head}:{port}"]
     try:
+        if own != head:
+            _await_port(head, port, asked)
         if asked.to_end:
             return 0
         print(f"{socket.gethostname()}: Ray at {own}, {'head' if own == head else 'worker'}, {cpus} CPUs", flush=True)
         ray = subprocess.Popen(
-            [sys.executable, "-m", "ray.scripts.scripts", "start", *options],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, preexec_fn=_die_with_parent,  # noqa: PLW1509 - there are no threads here
+            [sys.executable, "-m", "ray.scripts.scripts", "start", *_options(own, head, port, cpus, temp)],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - there are no threads here
         )  # fmt: skip
         while ray.poll() is None and not asked.to_end:
             time.sleep(_LOOK_SECONDS)
-        if not asked.to_end:
-            print(f"{socket.gethostname()}: Ray has ended with exit code {ray.returncode}", file=sys.stderr, flush=True)
-        return 0 if asked.to_end else 1
+        if asked.to_end:
+            return 0
+        print(f"{socket.gethostname()}: Ray has ended with exit code {ray.returncode}", file=sys.stderr, flush=True)
+        return 1
     finally:
         _end_all(temp)
+
+
+def _options(own: str, head: str, port: int, cpus: int, temp: Path) -> list[str]:
+    options = [
+        f"--node-ip-address={own}", f"--num-cpus={cpus}", f"--object-store-memory={_OBJECT_STORE_BYTES}",
+        f"--temp-dir={temp / 'r'}", "--min-worker-port=0", "--max-worker-port=0", "--disable-usage-stats", "--block",
+        f"--dashboard-agent-listen-port={port + 1}", "--include-log-monitor=false",
+    ]  # fmt: skip
+    if own == head:
+        return [*options, "--head", f"--port={port}", "--include-dashboard=false",
+                f"--ray-client-server-port={port + 2}"]  # fmt: skip
+    return [*options, f"--address={head}:{port}"]
 
 
 class _Asked:
@@ -110,7 +115,8 @@ class _Asked:
         self.to_end = False
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._note)
-        signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # for runs: their script tells them
+        for number in (signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP):  # for runs, whose script tells them
+            signal.signal(number, signal.SIG_IGN)  # Ray inherits it
 
     def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - the signature is Python's
         self.to_end = True
@@ -131,22 +137,15 @@ def _await_port(host: str, port: int, asked: _Asked) -> None:
 
 
 def _end_all(temp: Path) -> None:
-    """Ray first, so that its folder is gone at once; then the runs, which get time for a checkpoint."""
-    ours = _below()
-    rays = [process for process in ours if _is_ray(process)]
-    for process in rays:
-        with contextlib.suppress(psutil.Error):
-            process.terminate()
-    _reap_until(lambda: not any(_alive(process) for process in rays), _RAY_SECONDS)
-    for process in rays:
-        with contextlib.suppress(psutil.Error):
-            process.kill()
+    """Ray at once, which keeps nothing; then what supervises runs, which notices, and gets time for a checkpoint."""
+    for process in _below():
+        if not _is_supervisor(process):
+            _kill(process)
     shutil.rmtree(temp, ignore_errors=True)
     _reap_until(lambda: not _below(), _LINGER_SECONDS)
     for process in _below():
-        with contextlib.suppress(psutil.Error):
-            process.kill()
-    _reap_until(lambda: not _below(), _RAY_SECONDS)
+        _kill(process)
+    _reap_until(lambda: not _below(), _LOOK_SECONDS)
     shutil.rmtree(temp, ignore_errors=True)
 
 
@@ -160,12 +159,16 @@ def _alive(process: psutil.Process) -> bool:
     return False
 
 
-def _is_ray(process: psutil.Process) -> bool:
-    """Whether it is Ray itself, and no run, nor what supervises one."""
+def _is_supervisor(process: psutil.Process) -> bool:
+    """Whether it supervises a run, or is one: those are forks, with the same command line."""
     with contextlib.suppress(psutil.Error):
-        words = process.cmdline()
-        return not any("space_dist.supervisor" in word for word in words)
+        return "space_dist.supervisor" in process.cmdline()
     return False
+
+
+def _kill(process: psutil.Process) -> None:
+    with contextlib.suppress(psutil.Error):
+        process.kill()
 
 
 def _reap_until(done: Callable[[], bool], seconds: float) -> None:

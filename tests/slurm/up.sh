@@ -74,7 +74,7 @@ DefMemPerCPU=100
 ReturnToService=2
 SlurmdTimeout=10
 SlurmctldTimeout=10
-KillWait=5
+KillWait=20
 MinJobAge=3600
 SchedulerParameters=sched_interval=1,bf_interval=1
 AccountingStorageType=accounting_storage/none
