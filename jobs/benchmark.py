@@ -1,17 +1,17 @@
-"""Benchmarks that print ratios measured in one run: `python jobs/benchmark.py curriculum`."""
+"""Benchmarks that print ratios measured in one run: `python jobs/benchmark.py --help` lists them."""
 
 from __future__ import annotations
 
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
 import typer
-from benchmarks import curriculum
+from benchmarks import curriculum, grid
 from rich.console import Console
 
 from space_dist.errors import SpaceDistError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-for _benchmark in (curriculum.curriculum,):
+for _benchmark in (curriculum.curriculum, grid.grid):
     app.command()(_benchmark)
 
 

@@ -404,6 +404,7 @@ class Grid:
         self.stop_file = self.folder / "stop"
         self.log = self.folder / "grid.log"
         self.tracking_log = self.folder / "tracking.log"
+        self.tracking_lock = self.folder / "tracking.lock"
 
     def __repr__(self) -> str:
         return f"Grid({str(self.folder)!r})"

@@ -41,6 +41,7 @@ STEPS_PER_SECOND = 4_000.0  # of a run whose speed nobody has measured yet: PPO 
 _OBJECT_STORE_BYTES = 256 << 20
 _POLL_SECONDS = 1.0
 _NODES_SECONDS = 180.0
+_AGENT_SECONDS = 60.0
 _LATE_SECONDS = 60.0  # without a sign of life of its supervisor a job is taken for lost
 _LIVE = (JobStatus.PENDING, JobStatus.RUNNING)
 _MAX_JOB_NAME = 60
@@ -65,8 +66,10 @@ def conduct(
         _await_nodes(nodes, stop_requested)
         size = _room_for(manifest, max_parallel)
         in_jobs = address != "local" and _as_jobs(grid, manifest, runs, mode)
-        place = Jobs(grid, manifest, size, dashboard) if in_jobs else Pool(grid, manifest, min(size, max(1, len(runs))))
-        with place as executor:
+        pool_size = min(size, max(1, len(runs)))
+        with (
+            Jobs(grid, manifest, size, dashboard) if in_jobs else Pool(grid, manifest, pool_size, stop_requested)
+        ) as executor:
             return Conductor(
                 grid, manifest, runs, executor, stop_requested=stop_requested, observe=observe
             ).conduct()  # fmt: skip
@@ -189,22 +192,18 @@ class Jobs:
             ]  # fmt: skip
             grace = self._manifest.resources.grace_seconds
             environment = {"RAY_JOB_STOP_WAIT_TIME_S": str(int(grace) + 30), "PYTHONUNBUFFERED": "1"}
-            try:
-                self._client.submit_job(
-                    entrypoint=shlex.join(command), submission_id=job, entrypoint_num_cpus=1,
-                    runtime_env={**self._runtime_env, "env_vars": environment},
-                    metadata={
-                        "grid": self._manifest.name, "folder": str(self._grid.folder), "cell": run.cell.id,
-                        "label": run.cell.label, "seed": str(run.seed), "attempt": str(attempt),
-                        "code": self._manifest.code, **self._manifest.git,
-                    },
-                )  # fmt: skip
-            except RuntimeError as error:
-                if "already exists" not in str(error):
-                    raise SpaceDistError(f"Ray does not take the job {job}: {str(error).splitlines()[0]}") from error
-                if (details := self._details(job)) is None or details.status not in _LIVE:
-                    attempt += 1  # an id can be used once, even if its job never began
-                    continue
+            taken = _submit(
+                self._client, entrypoint=shlex.join(command), submission_id=job, entrypoint_num_cpus=1,
+                runtime_env={**self._runtime_env, "env_vars": environment},
+                metadata={
+                    "grid": self._manifest.name, "folder": str(self._grid.folder), "cell": run.cell.id,
+                    "label": run.cell.label, "seed": str(run.seed), "attempt": str(attempt),
+                    "code": self._manifest.code, **self._manifest.git,
+                },
+            )  # fmt: skip
+            if not taken and ((details := self._details(job)) is None or details.status not in _LIVE):
+                attempt += 1  # an id can be used once, even if its job never began
+                continue
             self._live[job] = (run, attempt)
             return
 
@@ -259,6 +258,22 @@ class Jobs:
                 self._client.stop_job(job)
 
 
+def _submit(client: JobSubmissionClient, **job: Any) -> bool:
+    """Submit a job; False if its id is taken. Raises SpaceDistError if Ray does not take it."""
+    deadline = time.monotonic() + _AGENT_SECONDS
+    while True:
+        try:
+            client.submit_job(**job)
+        except (RuntimeError, requests.RequestException) as error:
+            if "already exists" in str(error):
+                return False
+            if "No available agent" not in str(error) or time.monotonic() > deadline:
+                raise SpaceDistError(f"Ray does not take the job {job['submission_id']}: {_first(error)}") from error
+            time.sleep(_POLL_SECONDS)  # the cluster has only just started
+        else:
+            return True
+
+
 def _job_name(manifest: Manifest) -> str:
     return manifest.name[:_MAX_JOB_NAME]
 
@@ -301,15 +316,11 @@ class Remote:
             runtime_env: dict[str, Any] = {"working_dir": upload, "env_vars": environment}
             if py_modules:
                 runtime_env["py_modules"] = [str(path.absolute()) for path in py_modules]
-            try:
-                self._client.submit_job(
-                    entrypoint=shlex.join(command), submission_id=job, runtime_env=runtime_env,
-                    metadata={"conducts": str(self._folder), "grid": self._manifest.name,
-                              "code": self._manifest.code, **self._manifest.git},
-                )  # fmt: skip
-            except RuntimeError as error:
-                if "already exists" not in str(error):  # somebody else was faster
-                    raise SpaceDistError(f"Ray at {self._address} does not take the grid: {error}") from error
+            _submit(  # or somebody else was faster, with the same
+                self._client, entrypoint=shlex.join(command), submission_id=job, runtime_env=runtime_env,
+                metadata={"conducts": str(self._folder), "grid": self._manifest.name, "code": self._manifest.code,
+                          **self._manifest.git},
+            )  # fmt: skip
         return job
 
     def follow(self, job: str, say: Callable[[str], None], stop_requested: Callable[[], str | None]) -> int:

@@ -35,7 +35,7 @@ import psutil
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.manifest import Grid, Manifest, Run, RunResources
-from space_dist.standing import Attempts, Cause, Ended, last_lines
+from space_dist.standing import Attempts, Cause, Ended, last_lines, slurm_job
 
 OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
@@ -80,7 +80,7 @@ class Supervisor:
         if ledger.owner_alive():
             return Busy(None, "another process is working on it")
         attempts = Attempts(ledger)
-        attempts.begin(task.attempt, task.where)
+        attempts.begin(task.attempt, {**slurm_job(), **task.where})
         out_of_memory_before = _system_kills()
         child = _Child.fork(lambda: _work(grid, manifest, run, task.address), ledger.folder / OUTPUT)
         watch = _Watch(child, manifest.resources, attempts)
@@ -356,13 +356,11 @@ def main() -> None:
 
 
 def preload() -> None:
-    """Import what every run needs, so that forks need not."""
-    import sb3_contrib
-    import stable_baselines3
-
+    """Import what every run needs, so that forks need not. Starts no thread."""
     import space_dist.launch  # noqa: F401
+    from space_dist import learner
 
-    _ = (sb3_contrib, stable_baselines3)
+    learner.preload()
 
 
 if __name__ == "__main__":

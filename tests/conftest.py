@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -16,3 +17,25 @@ def _sb3_logs_in_pytests_folder(tmp_path_factory: pytest.TempPathFactory) -> Non
     """Stable-Baselines3's own `learn`, which some tests compare with, logs into the system's temporary folder."""
     folder: Path = tmp_path_factory.mktemp("sb3")
     os.environ["SB3_LOGDIR"] = str(folder)
+
+
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database with MLflow's tables: making them takes seconds, so it happens once."""
+    from space_dist.tracking import sync
+    from tests.test_report import start_run
+
+    folder = tmp_path_factory.mktemp("store")
+    sync([start_run(folder / "run")], f"sqlite:///{folder / 'mlflow.db'}", "unused")
+    return folder / "mlflow.db"
+
+
+@pytest.fixture
+def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A store of the test's own, in a folder whose name needs care, and a current folder that must stay empty."""
+    store = tmp_path / "a store #1"
+    store.mkdir()
+    shutil.copy(empty_store, store / "mlflow.db")
+    (tmp_path / "cwd").mkdir()
+    monkeypatch.chdir(tmp_path / "cwd")
+    return f"sqlite:///{store / 'mlflow.db'}"

@@ -15,6 +15,8 @@ from space_dist.config import to_yaml
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Ledger, RunWriter, Status, find_ledgers
 from space_dist.report import (
+    Estimate,
+    Interval,
     bootstrap_interval,
     build_report,
     draw_comparison,
@@ -176,9 +178,9 @@ def test_the_interval_is_the_same_in_every_call_and_place() -> None:
 
 def test_one_seed_has_no_interval_and_none_no_number() -> None:
     one, none = estimate(np.array([2.0])), estimate(np.array([]))
-    assert (one.iqm, one.mean, one.median, one.low, one.high) == (2.0, 2.0, 2.0, None, None)
+    assert one == Estimate(1, *[Interval(2.0, None, None)] * 3)
     assert none.n == 0
-    assert np.isnan(none.iqm)
+    assert np.isnan(none.iqm.value)
 
 
 # ---- the report -----------------------------------------------------------------------------------------------------
@@ -244,7 +246,7 @@ def test_set_sizes_are_held_between_their_changes(tmp_path: Path) -> None:
     median = draw_comparison([configuration]).axes[2].get_lines()[-1]
     np.testing.assert_array_equal(median.get_ydata(), [2.0, 2.5, 3.5, 3.5])
 
-    summary = summarise(configuration)
+    (summary,) = summarise([configuration])
     assert (summary.set_size, summary.n_instances, summary.reached, summary.reached_at) == (3.5, 4, 1, 2000)
 
 
@@ -315,6 +317,25 @@ def test_configurations_of_one_name_are_told_apart(tmp_path: Path) -> None:
     labels = [row["configuration"] for row in build_report(find_ledgers([tmp_path]), tmp_path / "out").table]
     assert len(set(labels)) == 3
     assert all(label.startswith("space ") for label in labels)
+
+
+def test_runs_of_equal_settings_are_one_configuration_whatever_they_are_called(tmp_path: Path) -> None:
+    finished_run(tmp_path / "a", 1.0, seed=0, name="monday")
+    finished_run(tmp_path / "b", 3.0, seed=1, name="tuesday")
+    runs = [load_run(ledger) for ledger in find_ledgers([tmp_path])]
+    assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday + tuesday", 2)]
+    finished_run(tmp_path / "c", 5.0, seed=1, name="monday")  # the same seed twice: now the names tell them apart
+    runs = [load_run(ledger) for ledger in find_ledgers([tmp_path])]
+    assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday", 2), ("tuesday", 1)]
+
+
+def test_a_default_written_out_makes_no_other_configuration(tmp_path: Path) -> None:
+    for seed in range(2):
+        ledger = finished_run(tmp_path / f"s{seed}", 1.0, seed=seed)
+        text = ledger.config.read_text()
+        assert "kappa: 1" in text
+        ledger.config.write_text(text if seed else text.replace("kappa: 1", "kappa: 1, pic: improvement"))
+    assert len(group([load_run(ledger) for ledger in find_ledgers([tmp_path])])) == 1
 
 
 def test_resources_and_tracking_do_not_make_another_configuration(tmp_path: Path) -> None:

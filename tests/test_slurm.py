@@ -212,7 +212,7 @@ def test_time_limits_are_read_as_slurm_does(text: str | int, expected: int | Non
 
 def test_templates_can_be_replaced_and_their_faults_are_named(manifest: Manifest, tmp_path: Path) -> None:
     made = Export(manifest, profile(comment="it's"), "array")
-    (tmp_path / "finish.sh.j2").write_text("echo {{ temp ~ \"'\" }}\nexit 0\n")
+    (tmp_path / "finish.sh.j2").write_text('echo {{ temp ~ "\'" }}\nexit 0\n')
     text = render(made, tmp_path)[TRAIN]
     assert text.endswith("""echo '/tmp'"'"''\nexit 0\n""")  # quoted without being asked to
     assert "scontrol requeue" not in text
@@ -293,7 +293,9 @@ def test_the_hostile_values_are_hostile(tmp_path: Path) -> None:
     for index, value in enumerate(HOSTILE):
         canary = tmp_path / str(index)
         for form in (f"echo {value}", f'echo "{value}"', f"echo '{value}'"):
-            subprocess.run(["bash", "-c", form], env={"C": str(canary), "PATH": "/bin"}, capture_output=True, cwd=tmp_path)
+            subprocess.run(
+                ["bash", "-c", form], env={"C": str(canary), "PATH": "/bin"}, capture_output=True, cwd=tmp_path
+            )
         acted += canary.exists()
     assert len(HOSTILE) >= 200
     assert acted > 120

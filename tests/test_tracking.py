@@ -23,25 +23,6 @@ from tests.test_report import GROWTH, STARTED, STEPS, continue_run, finished_run
 TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
 
 
-@pytest.fixture(scope="module")
-def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database with MLflow's tables: making them takes seconds, so it happens once."""
-    folder = tmp_path_factory.mktemp("store")
-    sync([start_run(folder / "run")], f"sqlite:///{folder / 'mlflow.db'}", "unused")
-    return folder / "mlflow.db"
-
-
-@pytest.fixture
-def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A store of the test's own, in a folder whose name needs care, and a current folder that must stay empty."""
-    store = tmp_path / "a store #1"
-    store.mkdir()
-    shutil.copy(empty_store, store / "mlflow.db")
-    (tmp_path / "cwd").mkdir()
-    monkeypatch.chdir(tmp_path / "cwd")
-    return f"sqlite:///{store / 'mlflow.db'}"
-
-
 def only_run(uri: str, experiment: str = "tests") -> Run:
     client = MlflowClient(uri)
     found = client.get_experiment_by_name(experiment)

@@ -10,15 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from space_dist.cli.terminal import STOP, Overrides, Runs, console, say, warn, write
+from space_dist.cli.terminal import STOP, Overrides, console, say, warn, write
+from space_dist.errors import ConfigError
 
 if TYPE_CHECKING:
-    from space_dist.report import Report
+    from space_dist.manifest import Grid
+    from space_dist.report import GridReport, Report
     from space_dist.training import Progress
 
 _REPORT_WIDTH = 200  # characters
+_GRID_WIDTH = 150
+_MAX_CELLS_SHOWN = 60
+_YAML = (".yaml", ".yml")
 
 
 def train(
@@ -105,14 +111,56 @@ def evaluate(
 
 
 def report(
-    runs: Runs,
-    out: Annotated[Path, typer.Option(help="Folder for the figure and the tables.")] = Path("report"),
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="PATH...", help="A grid (folder or YAML file); or run folders, or their own."),
+    ],
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder for figures and tables. Default: report; of a grid: report in the grid's folder."),
+    ] = None,
+    baseline: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="CELL", help="Of a grid: compare with this cell (label or id), not the grid's baseline."),
+    ] = None,
+    threshold: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Of a grid: steps to this test return; default: to the baseline's final IQM."),
+    ] = None,
+    root: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Of a grid's YAML file: folder that holds the grids' folders, as of `space-dist grid`."),
+    ] = None,
 ) -> None:
-    """Compare runs: a figure and a table with 95 % bootstrap intervals over seeds."""
+    """Compare runs, or the cells of a grid: figures and tables with 95 % bootstrap intervals over seeds."""
     from space_dist.ledger import find_ledgers
-    from space_dist.report import build_report
+    from space_dist.report import build_grid_report, build_report
 
-    print_report(build_report(find_ledgers(runs), out), console)
+    if len(paths) == 1 and _is_grid(paths[0]):
+        grid = _grid(paths[0], root)
+        print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
+        return
+    if grids := [path for path in paths if _is_grid(path)]:
+        raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
+    if baseline is not None or threshold is not None:
+        raise ConfigError(f"--baseline and --threshold are for grids; {paths[0]} is none")
+    print_report(build_report(find_ledgers(paths), Path("report") if out is None else out), console)
+
+
+def _is_grid(path: Path) -> bool:
+    from space_dist.manifest import MANIFEST
+
+    return (path / MANIFEST).is_file() or (not path.is_dir() and (path.name == MANIFEST or path.suffix in _YAML))
+
+
+def _grid(path: Path, root: Path | None) -> Grid:
+    from space_dist.manifest import find_grid
+
+    if root is None and path.suffix in _YAML:  # only then, for this imports torch
+        from space_dist.launch import workplace
+
+        root = workplace() / "runs"
+    return find_grid(path, root or Path())
 
 
 def print_report(result: Report, to: Console) -> None:
@@ -135,27 +183,58 @@ def print_report(result: Report, to: Console) -> None:
     to.print(f"Figure and tables: {result.figure.parent}", highlight=False, soft_wrap=True)
 
 
+def print_grid_report(result: GridReport, to: Console) -> None:
+    """Show what a grid's report says in short, and where the whole of it is."""
+    for sentence in result.summary:
+        to.print(sentence, highlight=False, markup=False)
+    rows = result.table[:_MAX_CELLS_SHOWN]
+    if to.width >= _GRID_WIDTH:
+        table = Table(*rows[0])
+        for row in rows:
+            table.add_row(*map(escape, row.values()))
+        to.print(table)
+    else:  # a block for each cell
+        for row in rows:
+            name, *others = row.items()
+            to.print(f"\n{name[1]}", style="bold", highlight=False, markup=False)
+            for column, text in others:
+                to.print(f"  {column}: {text}", highlight=False, markup=False)
+    if len(result.table) > len(rows):
+        to.print(f"... and {len(result.table) - len(rows):,} more cells, all in cells.csv.", highlight=False)
+    for remark in result.remarks:
+        to.print(remark, highlight=False, markup=False)
+    to.print(f"Report: {result.folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
 def sync(
-    runs: Runs,
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN|GRID...", help="Runs' or grids' folders, folders that hold some, or grids' YAML files."
+        ),
+    ],
     uri: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Tracking URI; default: each run's own (tracking.uri)."),
+        typer.Option(help="Tracking URI; default: each run's or grid's own (tracking.uri)."),
     ] = None,
     experiment: Annotated[Optional[str], typer.Option(help="MLflow experiment.")] = None,  # noqa: UP045
-    follow: Annotated[bool, typer.Option("--follow", help="Go on until the runs have ended.")] = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Go on until nobody works on the grids, and the runs have ended.")
+    ] = False,
+    root: Annotated[Path, typer.Option(help="Where the grids of YAML files are.")] = Path("runs"),
 ) -> None:
-    """Replay runs into MLflow. Doing it twice changes nothing."""
-    from space_dist.ledger import find_ledgers
+    """Replay runs and grids into MLflow. Doing it twice changes nothing."""
+    from space_dist.manifest import find_grid
+    from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs
 
-    ledgers = find_ledgers(runs)
+    paths = [find_grid(path, root).folder if path.is_file() else path for path in runs]
+    found = find(paths)
     if follow:
-        result = follow_runs(
-            runs, uri, experiment, stop=lambda: not any(ledger.owner_alive() for ledger in ledgers)
-        )  # fmt: skip
+        result = follow_runs(paths, uri, experiment)
     else:
-        result = sync_runs(ledgers, uri, experiment)
+        result = sync_runs(found.ledgers, uri, experiment, grids=found.grids)
     console.print(
         f"{result.runs} runs are up to date in MLflow ({result.created} new, {result.rows} rows pushed"
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),

@@ -42,4 +42,19 @@ def make_learner(
     return kinds[type(config)](config, observation_space, action_space, seed=seed, total_steps=total_steps)
 
 
-__all__ = ["Arrays", "Learner", "OffPolicyLearner", "OnPolicyLearner", "Update", "make_learner", "refuse_spaces"]
+def preload() -> None:
+    """Have torch load what it loads with the first optimiser: a second that forked runs need not spend each."""
+    torch.set_num_threads(1)
+    torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+
+
+__all__ = [
+    "Arrays",
+    "Learner",
+    "OffPolicyLearner",
+    "OnPolicyLearner",
+    "Update",
+    "make_learner",
+    "preload",
+    "refuse_spaces",
+]

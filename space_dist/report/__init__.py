@@ -8,18 +8,23 @@ from pathlib import Path
 
 from space_dist.errors import ConfigError
 from space_dist.ledger import Ledger, atomic_write
-from space_dist.report.figures import draw_comparison, draw_curriculum, draw_learning_curve, save
+from space_dist.report.document import Document, Picture, Section, to_markdown
+from space_dist.report.figures import draw_comparison, draw_curriculum, draw_learning_curve, png, save
+from space_dist.report.grid_report import GridReport, build_grid_report
 from space_dist.report.load import Configuration, Run, group, load_run, read_config
-from space_dist.report.statistics import RESAMPLES, Estimate, bootstrap_interval, estimate, interquartile_mean
-from space_dist.report.tables import Summary, cells, remarks, summarise, to_csv, to_markdown
+from space_dist.report.statistics import RESAMPLES, Estimate, Interval, bootstrap_interval, estimate, interquartile_mean
+from space_dist.report.tables import Summary, cells, numbers, remarks, summarise, to_csv
 
 __all__ = [
     "Configuration",
     "Estimate",
+    "GridReport",
+    "Interval",
     "Report",
     "Run",
     "Summary",
     "bootstrap_interval",
+    "build_grid_report",
     "build_report",
     "draw_comparison",
     "draw_curriculum",
@@ -66,22 +71,19 @@ def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
     if not ledgers:
         raise ConfigError("there are no runs to report on")
     configurations = group([load_run(ledger) for ledger in ledgers])
-    summaries = [summarise(configuration) for configuration in configurations]
+    summaries = summarise(configurations)
     table = [cells(summary) for summary in summaries]
     notes = [line for configuration in configurations for line in remarks(configuration)]
-    parts = [
-        "# Report",
-        to_markdown(table),
-        *(["\n".join(f"- {note}" for note in notes)] if notes else []),
-        "![Learning curves and set sizes](report.png)",
-        _METHOD,
-    ]
-    markdown = "\n\n".join(parts) + "\n"
+    picture = Picture("report.png", "Learning curves and set sizes", png(draw_comparison(configurations)))
+    document = Document(
+        "Report", [Section("", rows=table, items=notes, pictures=[picture]), Section("How to read this", [_METHOD])]
+    )
+    markdown = to_markdown(document)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        save(draw_comparison(configurations), out / "report.png")
+        atomic_write(out / picture.file, picture.png)
         atomic_write(out / "report.md", markdown.encode())
-        atomic_write(out / "report.csv", to_csv(summaries).encode())
+        atomic_write(out / "report.csv", to_csv([numbers(summary) for summary in summaries]).encode())
     except OSError as error:
         raise ConfigError(f"the report cannot be written to {out}: {error.strerror or error}") from None
     return Report(table, notes, summaries, markdown, out / "report.png")

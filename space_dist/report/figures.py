@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import io
+import math
+import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
@@ -26,6 +30,9 @@ MAX_ROWS: Final = 500
 MAX_COLUMNS: Final = 1000
 MAX_LABELLED_INSTANCES: Final = 30
 MAX_MARKED: Final = 40  # a line of fewer evaluations shows each: one alone would be invisible
+MAX_WRITTEN: Final = 160  # places of a heat map that still have room for numbers
+_PANEL_COLUMNS: Final = 3
+_PANEL_LABEL: Final = 44  # characters in a line of a panel's legend
 _STEPS_LABEL: Final = "environment steps"
 _RETURN_LABEL: Final = "mean undiscounted return per episode"
 _DPI: Final = 150
@@ -45,7 +52,7 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
             "color": COLOURS[number % len(COLOURS)],
             "linestyle": LINE_STYLES[number // len(COLOURS) % len(LINE_STYLES)],
         }
-        label = f"{configuration.label} ({_seed_count(configuration)})"
+        label = _legend(configuration)
         _draw_returns(test, *configuration.returns("test"), label, style)
         _draw_returns(train, *configuration.returns("train"), label, style)
         _draw_set_sizes(sizes, configuration, label, style)
@@ -58,6 +65,89 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
     _count_upwards(sizes)
     columns = min(3, len(configurations))
     figure.legend(handles=test.get_lines(), loc="outside lower center", ncols=columns, frameon=False)
+    return figure
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Learning curves that are drawn into one diagram; `reference` is repeated, in grey, in every diagram."""
+
+    title: str
+    configurations: Sequence[Configuration]
+    reference: Configuration | None = None
+
+
+def draw_panels(panels: Sequence[Panel]) -> Figure:
+    """Test returns over real environment steps: IQMs over seeds with 95 % bootstrap bands, on axes of one scale."""
+    columns = min(_PANEL_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    longest = max(len(panel.configurations) for panel in panels)
+    figure = _figure(5.0 * columns, (3.6 + 0.24 * longest) * rows)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        if panel.reference is not None:
+            style = {"color": "#777777", "linestyle": "--"}
+            _draw_returns(axes, *panel.reference.returns("test"), _legend(panel.reference, _PANEL_LABEL), style)
+        for number, configuration in enumerate(panel.configurations):
+            style = {"color": COLOURS[number % len(COLOURS)], "linestyle": LINE_STYLES[number // len(COLOURS) % 4]}
+            _draw_returns(axes, *configuration.returns("test"), _legend(configuration, _PANEL_LABEL), style)
+        _dress(axes, _plain(panel.title), _RETURN_LABEL)
+        axes.tick_params(labelbottom=True, labelleft=True)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), frameon=False, fontsize=8)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    return figure
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """Final test returns over two parameters, like the paper's Table 1.
+
+    `columns` and `rows` are the parameters' names and values as text; `means` and `spreads` are `(rows, columns)`: mean
+    and standard deviation over the finished seeds, NaN where there is none; `seeds` says how many there are: `9/10`.
+    """
+
+    title: str
+    column_name: str
+    row_name: str
+    columns: Sequence[str]
+    rows: Sequence[str]
+    means: FloatArray
+    spreads: FloatArray
+    seeds: Sequence[Sequence[str]]
+
+    def text(self, row: int, column: int) -> str:
+        """What is known of a place: `5.10 ± 0.70 (9/10)`; without seeds only how many are missing."""
+        mean, spread = self.means[row, column], self.spreads[row, column]
+        decimals = 2 if abs(mean) < 100 else 1 if abs(mean) < 10_000 else 0
+        number = "—" if math.isnan(mean) else f"{mean:,.{decimals}f}"
+        number += "" if math.isnan(spread) else f" ± {spread:,.{decimals}f}"
+        return f"{number} ({self.seeds[row][column]})" if self.seeds[row][column] else "—"
+
+
+def draw_heat_map(found: HeatMap, low: float, high: float) -> Figure:
+    """One map; `low` and `high` are the ends of the colour scale, shared by maps that are to be compared."""
+    n_rows, n_columns = found.means.shape
+    figure = _figure(min(16.0, 2.8 + 1.25 * n_columns), min(16.0, 1.8 + 0.72 * n_rows))
+    axes = figure.subplots()
+    colours = colormaps["cividis"].with_extremes(bad="#EEEEEE")
+    image = axes.imshow(found.means, cmap=colours, vmin=low, vmax=max(high, low + 1e-9), aspect="auto")
+    across, down = ([_plain(textwrap.shorten(value, 24, placeholder="…")) for value in values]
+                    for values in (found.columns, found.rows))  # fmt: skip
+    axes.set_xticks(range(n_columns), across, rotation=90 if sum(map(len, across)) > 9 * n_columns else 0)
+    axes.set_yticks(range(n_rows), down)
+    axes.set_xlabel(_plain(found.column_name))
+    axes.set_ylabel(_plain(found.row_name))
+    axes.set_title(_plain(found.title), fontsize=11)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    for row in range(n_rows) if n_rows * n_columns <= MAX_WRITTEN else ():
+        for column in range(n_columns):
+            shade = image.cmap(image.norm(found.means[row, column]))
+            dark = not math.isnan(found.means[row, column]) and sum(shade[:3]) < 1.5
+            axes.text(column, row, found.text(row, column).replace(" (", "\n("), ha="center", va="center", fontsize=9,
+                      color="white" if dark else "black")  # fmt: skip
+    figure.colorbar(image, ax=axes, label="mean test return")
     return figure
 
 
@@ -123,10 +213,11 @@ def draw_curriculum(run: Run) -> Figure:
     """
     if run.generates_contexts:
         raise ConfigError(f"{run.ledger.folder} was trained on generated contexts: it has no map of instances")
-    if not run.trained:
+    trained = run.trained
+    if not trained:
         raise LedgerError(f"{run.ledger.folder} holds no iteration yet")
-    order, shares = curriculum_shares(run.trained, run.instance_ids)
-    n, m = len(order), len(run.trained)
+    order, shares = curriculum_shares(trained, run.instance_ids)
+    n, m = len(order), len(trained)
     height, width = -(-n // MAX_ROWS), -(-m // MAX_COLUMNS)
     figure = _figure(7.5, 5.5)
     axes = figure.subplots()
@@ -153,9 +244,24 @@ def draw_curriculum(run: Run) -> Figure:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG, whole or not at all. Raises OSError."""
+    atomic_write(path, png(figure))
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
-    atomic_write(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
+def _plain(text: str) -> str:
+    """A user's words, which Matplotlib is not to read as mathematics."""
+    return text.replace("$", r"\$")
+
+
+def _legend(configuration: Configuration, width: int = 60) -> str:
+    words = f"{textwrap.fill(configuration.label, width, max_lines=3)} ({_seed_count(configuration)})"
+    return _plain(f" {words}" if words.startswith("_") else words)  # Matplotlib hides labels that begin so
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -195,7 +301,7 @@ def _draw_returns(axes: Axes, steps: IntArray, returns: FloatArray, label: str, 
 
 
 def _draw_set_sizes(axes: Axes, configuration: Configuration, label: str, style: dict[str, Any]) -> None:
-    curves = [_set_size_steps(run) for run in configuration.drawn if run.trained]
+    curves = [_set_size_steps(run) for run in configuration.drawn if len(run.set_sizes)]
     if not curves:
         return
     for steps, sizes in curves:
@@ -213,6 +319,6 @@ def _set_size_steps(run: Run) -> tuple[IntArray, IntArray]:
 
 
 def _seed_count(configuration: Configuration) -> str:
-    drawn, n = len(configuration.drawn), len(configuration.runs)
+    drawn, n = len(configuration.drawn), configuration.n_seeds
     unfinished = "" if configuration.finished else ", unfinished"
     return (f"{n} seed{'s' if n > 1 else ''}" if drawn == n else f"{drawn} of {n} seeds") + unfinished

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from space_dist.config import NOT_IDENTITY
+from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, Row, Status
 
@@ -32,8 +32,10 @@ class Run:
 
     `instance_ids` `(n,)` are the training instances, ascending. `evaluation_steps` `(k,)` are real environment steps;
     `train` and `test` map each of MEASURES to `(k,)` means over the split's instances in the environment's units, NaN
-    where there is no such number. `iteration_ends` `(m,)` are real environment steps, `trained` the m arrays of ids
-    that were trained on, in order.
+    where there is no such number. `iteration_ends` `(m,)` are real environment steps, `set_sizes` `(m,)` how many
+    instances each iteration was trained on. `generates_contexts`: some contexts it was trained on are not of the
+    instance set (their id is -1). `all_instances_reached_at`: the real step from which the run was first trained on
+    all its instances; None if it never was.
     """
 
     ledger: Ledger
@@ -44,7 +46,9 @@ class Run:
     train: Mapping[str, FloatArray]
     test: Mapping[str, FloatArray]
     iteration_ends: IntArray
-    trained: tuple[IntArray, ...]
+    set_sizes: IntArray
+    generates_contexts: bool
+    all_instances_reached_at: int | None
 
     @property
     def finished(self) -> bool:
@@ -57,9 +61,9 @@ class Run:
         return self.finished and len(self.evaluation_steps) > 0 and self.evaluation_steps[-1] == self.status.steps
 
     @property
-    def generates_contexts(self) -> bool:
-        """Whether some contexts it was trained on are not of the instance set (their id is -1)."""
-        return any(bool((ids < 0).any()) for ids in self.trained)
+    def trained(self) -> tuple[IntArray, ...]:
+        """The m arrays of ids that were trained on, in order; read anew, for those of many runs fill the memory."""
+        return _trained(self.ledger, _rows(self.ledger, CURRICULUM))
 
     def final(self, split: Split, measure: str) -> float:
         """The last evaluation's mean over the split. Raises LedgerError if nothing was evaluated yet."""
@@ -67,29 +71,27 @@ class Run:
             raise LedgerError(f"{self.ledger.folder} holds no evaluation yet")
         return float((self.test if split == "test" else self.train)[measure][-1])
 
-    @functools.cached_property
+    @property
     def set_size(self) -> tuple[IntArray, IntArray]:
         """`(m,)` real steps at which each iteration began, and `(m,)` the size of the set it was trained on."""
-        starts = np.concatenate((np.zeros(1, dtype=np.int64), self.iteration_ends))[:-1]
-        return starts, np.array([len(ids) for ids in self.trained], dtype=np.int64)
-
-    @functools.cached_property
-    def all_instances_reached_at(self) -> int | None:
-        """The real step from which the run was first trained on all its instances; None if it never was."""
-        everything = len(self.instance_ids)
-        starts, _ = self.set_size
-        for start, ids in zip(starts.tolist(), self.trained, strict=True):
-            if len(ids) >= everything and len(np.unique(ids[ids >= 0])) == everything:
-                return int(start)
-        return None
+        return _starts(self.iteration_ends), self.set_sizes
 
 
 @dataclass(frozen=True, eq=False)
 class Configuration:
-    """Runs that differ by nothing but their seed, ordered by it. `label` is the name, made unique in the report."""
+    """Runs that differ by nothing but their seed, ordered by it. `label` is unique in the report.
+
+    `absent` counts further seeds that are to run and have left nothing to read yet.
+    """
 
     label: str
     runs: tuple[Run, ...]
+    absent: int = 0
+
+    @property
+    def n_seeds(self) -> int:
+        """All seeds, read or not."""
+        return len(self.runs) + self.absent
 
     @property
     def finished(self) -> tuple[Run, ...]:
@@ -140,13 +142,14 @@ def read_config(ledger: Ledger) -> dict[str, Any]:
     return data
 
 
-def load_run(ledger: Ledger) -> Run:
-    """Everything reports need of a run, rows behind its last checkpoint included.
+def load_run(ledger: Ledger, config: Mapping[str, Any] | None = None) -> Run:
+    """Everything reports need of a run, rows behind its last checkpoint included. `config`: the run's, if known.
 
     Raises LedgerError if the folder is damaged or incomplete; having no rows yet is neither.
     """
     status = ledger.status()  # before the rows: a run that is done now has all of them
-    config, instance_ids = read_config(ledger), _instance_ids(ledger)
+    config = read_config(ledger) if config is None else config
+    instance_ids = _instance_ids(ledger)
     evaluations = [row for row in _rows(ledger, METRICS) if row.get("kind") == "evaluation"]
     iterations = _rows(ledger, CURRICULUM)
     try:
@@ -154,38 +157,84 @@ def load_run(ledger: Ledger) -> Run:
         train, test = ({measure: _column(evaluations, split, measure) for measure in MEASURES}
                        for split in ("train", "test"))  # fmt: skip
         ends = np.array([int(row["steps"]) for row in iterations], dtype=np.int64)
-        trained = tuple(np.array(row["trained"], dtype=np.int64) for row in iterations)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise LedgerError(f"{ledger.folder} has rows that this version cannot read: {error!r}") from None
-    return Run(ledger, config, status, instance_ids, steps, train, test, ends, trained)
+        raise _unreadable(ledger, error) from None
+    trained = _trained(ledger, iterations)
+    return Run(
+        ledger, config, status, instance_ids, steps, train, test, ends,
+        set_sizes=np.array([len(ids) for ids in trained], dtype=np.int64),
+        generates_contexts=any(bool((ids < 0).any()) for ids in trained),
+        all_instances_reached_at=_all_reached_at(instance_ids, _starts(ends), trained),
+    )  # fmt: skip
+
+
+def _trained(ledger: Ledger, iterations: Sequence[Row]) -> tuple[IntArray, ...]:
+    try:
+        return tuple(np.array(row["trained"], dtype=np.int64) for row in iterations)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise _unreadable(ledger, error) from None
+
+
+def _unreadable(ledger: Ledger, error: Exception) -> LedgerError:
+    return LedgerError(f"{ledger.folder} has rows that this version cannot read: {error!r}")
+
+
+def _starts(ends: IntArray) -> IntArray:
+    return np.concatenate((np.zeros(1, dtype=np.int64), ends))[:-1]
+
+
+def _all_reached_at(instance_ids: IntArray, starts: IntArray, trained: Sequence[IntArray]) -> int | None:
+    everything = len(instance_ids)
+    for start, ids in zip(starts.tolist(), trained, strict=True):
+        if len(ids) >= everything and len(np.unique(ids[ids >= 0])) == everything:
+            return int(start)
+    return None
 
 
 def group(runs: Sequence[Run]) -> list[Configuration]:
-    """The configurations in the order of their first run. Raises ConfigError if a seed is there twice in one."""
-    members: dict[str, dict[int, Run]] = {}
+    """The configurations in the order of their first run: runs of equal settings, whatever they are called.
+
+    Where a seed is there twice, their names tell configurations apart. Raises ConfigError if a seed is there twice
+    under one name.
+    """
+    members: dict[str, list[Run]] = {}
     for run in runs:
-        seeds = members.setdefault(_identity(run), {})
+        members.setdefault(_identity(run), []).append(run)
+    parts: list[tuple[str, str, list[Run]]] = []  # name, identity, runs
+    for identity, alike in members.items():
+        names = list(dict.fromkeys(run.status.name for run in alike))
+        if len({run.status.seed for run in alike}) == len(alike):
+            parts.append((" + ".join(names), identity, alike))
+        else:
+            parts += [(name, identity, [run for run in alike if run.status.name == name]) for name in names]
+    names = [name for name, _, _ in parts]
+    return [
+        Configuration(name if names.count(name) == 1 else f"{name} {identity[:6]}", _by_seed(alike))
+        for name, identity, alike in parts
+    ]
+
+
+def _by_seed(runs: Sequence[Run]) -> tuple[Run, ...]:
+    seeds: dict[int, Run] = {}
+    for run in runs:
         twin = seeds.setdefault(run.status.seed, run)
         if twin is not run:
             raise ConfigError(
                 f"seed {run.status.seed} of {run.status.name} is there twice: in {twin.ledger.folder} and in "
                 f"{run.ledger.folder}. A seed may count once; leave one of the folders out"
             )
-    names = [next(iter(seeds.values())).status.name for seeds in members.values()]
-    return [
-        Configuration(
-            name if names.count(name) == 1 else f"{name} {identity[:6]}",
-            tuple(seeds[seed] for seed in sorted(seeds)),
-        )
-        for name, (identity, seeds) in zip(names, members.items(), strict=True)
-    ]
+    return tuple(seeds[seed] for seed in sorted(seeds))
 
 
 def _identity(run: Run) -> str:
     """A hash of all that decides results but the seed; instance files count by content, not by where they lay."""
-    data = {key: value for key, value in run.config.items() if key not in {"seed", *NOT_IDENTITY}}
-    data["instances"] = [_read_instances(run.ledger, split) for split in ("train", "test")]
-    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()
+    digests = [hashlib.sha256(_read_instances(run.ledger, split).encode()).hexdigest() for split in ("train", "test")]
+    try:
+        return configs.identity(configs.parse(run.config, str(run.ledger.config)), *digests, with_seed=False)
+    except ConfigError:  # of another version's schema: its words are compared as they stand
+        data = {key: value for key, value in run.config.items() if key not in {"seed", *configs.NOT_IDENTITY}}
+        data["instances"] = digests
+        return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _read_instances(ledger: Ledger, split: Split) -> str:
@@ -199,13 +248,21 @@ def _read_instances(ledger: Ledger, split: Split) -> str:
 
 
 def _instance_ids(ledger: Ledger) -> IntArray:
-    header, *lines = _read_instances(ledger, "train").splitlines() or [""]
+    ids = _ids_of(_read_instances(ledger, "train"))
+    if ids is None:
+        raise LedgerError(f"{ledger.instances('train')} is damaged: not every row has an id")
+    return ids
+
+
+@functools.lru_cache(maxsize=8)  # most runs of a report were trained on the same instances
+def _ids_of(text: str) -> IntArray | None:
+    """`(n,)` the ids in an instance file, ascending; None if not every row has one."""
+    header, *lines = text.splitlines() or [""]
     try:
         column = [name.strip() for name in header.split(",")].index("id")
-        ids = sorted(int(line.split(",")[column]) for line in lines if line.strip())
-    except (ValueError, IndexError):
-        raise LedgerError(f"{ledger.instances('train')} is damaged: not every row has an id") from None
-    return np.array(ids, dtype=np.int64)
+        return np.array(sorted(int(line.split(",")[column]) for line in lines if line.strip()), dtype=np.int64)
+    except (ValueError, IndexError, OverflowError):
+        return None
 
 
 def _rows(ledger: Ledger, name: str) -> list[Row]:

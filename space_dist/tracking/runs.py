@@ -1,9 +1,7 @@
-"""MLflow as a mirror: committed rows of ledgers are replayed into experiments. The only importer of MLflow.
+"""One run into one MLflow store: what of a run is to be mirrored, and the calls that bring it there.
 
-A run is found by its tag `space_dist.run` before it is created, and `space_dist.synced_rows` says how many rows of
-metrics.jsonl are there. That tag is written after the rows it counts: what dies in between pushes some points again,
-and MLflow keeps a point of the same (key, time, step, value) once. So pushing twice changes nothing, and whatever
-MLflow loses or misses is pushed again from the ledger.
+`space_dist.synced_rows` says how many rows of metrics.jsonl are there. That tag is written after the rows it counts:
+what dies in between pushes some points again, and MLflow keeps a point of the same (key, time, step, value) once.
 """
 
 from __future__ import annotations
@@ -17,30 +15,34 @@ import os
 import re
 import sqlite3
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
-from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status, find_ledgers
+from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric
     from mlflow.entities import Run as MlflowRun
 
-log = logging.getLogger(__name__)
+log = logging.getLogger("space_dist.tracking")
 
 RUN_TAG: Final = "space_dist.run"
 ROWS_TAG: Final = "space_dist.synced_rows"
 ARTIFACTS_TAG: Final = "space_dist.artifacts"
+GRID_TAG: Final = "space_dist.grid_key"
+STARTED_TAG: Final = "space_dist.started"
+STAMP_TAG: Final = "space_dist.stamp"
+TABLE_TAG: Final = "space_dist.results"
+NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
 
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
-_MAX_PARAM, _MAX_TAG, _MAX_KEY = 6000, 5000, 250  # characters
+_MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
+_PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
 _ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
 # MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
@@ -57,92 +59,29 @@ class TrackingError(SpaceDistError):
     """MLflow cannot be reached or does not take what it is sent. The ledgers are untouched."""
 
 
-@dataclass(frozen=True)
-class SyncResult:
-    """What a `sync` did.
-
-    `runs` were brought up to date, `created` of them newly; `rows` of metrics.jsonl were pushed; `skipped` runs have
-    no tracking URI. `failed` names, by folder, the runs that could not be mirrored because their ledger is damaged or
-    MLflow refused their content: whoever calls must show them.
-    """
-
-    runs: int = 0
-    created: int = 0
-    rows: int = 0
-    skipped: int = 0
-    failed: Mapping[Path, str] = dataclass_field(default_factory=dict)
-
-
-def sync(ledgers: Sequence[Ledger], uri: str | None = None, experiment: str | None = None) -> SyncResult:
-    """Bring MLflow up to date with the committed rows of the runs. Doing it again changes nothing.
-
-    `uri` and `experiment` default to each run's own (`tracking.uri`, `tracking.experiment` of its config). A run that
-    was deleted in MLflow is replayed afresh.
-
-    Raises ConfigError for a URI or experiment that cannot be used, TrackingError if a store cannot be reached.
-    """
-    return _Mirror(uri, experiment).push(ledgers)
-
-
-def follow(
-    root: Path | Sequence[Path],
-    uri: str | None = None,
-    experiment: str | None = None,
-    poll_seconds: float = 5.0,
-    *,
-    stop: Callable[[], bool],
-) -> SyncResult:
-    """Keep MLflow up to date with all runs in and below `root` until `stop()` is true, then push a last time.
-
-    Runs may appear later. While a store cannot be reached nothing is lost: it is logged once, and once more when it is
-    back. Returns the sum of what was done, `failed` as of the last push.
-
-    Raises ConfigError as `sync` does, and TrackingError if the last push fails.
-    """
-    mirror = _Mirror(uri, experiment)
-    roots = [root] if isinstance(root, Path) else list(root)
-    total, failed, unreachable = SyncResult(), dict[Path, str](), False
-    while True:
-        last = stop()
-        try:
-            done = mirror.push(_find(roots))
-        except TrackingError as error:
-            if last:
-                raise
-            if not unreachable:
-                log.warning("%s", error)
-            unreachable = True
-        else:
-            if unreachable:
-                log.warning("MLflow can be reached again")
-            unreachable = False
-            for folder, reason in done.failed.items():
-                if failed.get(folder) != reason:
-                    log.warning("%s is not mirrored: %s", folder, reason)
-            failed = dict(done.failed)
-            total = SyncResult(
-                done.runs, total.created + done.created, total.rows + done.rows, done.skipped, done.failed
-            )
-        if last:
-            return total
-        until = time.monotonic() + poll_seconds
-        while (left := until - time.monotonic()) > 0 and not stop():
-            time.sleep(min(left, 0.2))
-
-
-def _find(roots: Sequence[Path]) -> list[Ledger]:
-    found: dict[Path, Ledger] = {}
-    for root in roots:
-        with contextlib.suppress(LedgerError):  # no run there yet
-            found |= {ledger.folder.resolve(): ledger for ledger in find_ledgers([root])}
-    return list(found.values())
-
-
 # ---- a run's side ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Snapshot:
+class Part:
+    """What a run is to MLflow as a part of a grid.
+
+    key: `(32 hex digits)` of grid, cell and seed. title: the child's name. remark: the end of its description.
+    tags: more of them, the parent's id among them. ending: how it stands in MLflow's words. ended_at: seconds since
+    the epoch. stamp: changes whenever anything that is pushed does; a child that has it is up to date.
+    """
+
+    key: str
+    title: str
+    remark: str
+    tags: Mapping[str, str]
+    ending: str
+    ended_at: float
+    stamp: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
     """What of a run is to be mirrored, read before MLflow is asked anything."""
 
     ledger: Ledger
@@ -152,21 +91,44 @@ class _Snapshot:
     rows: Sequence[Row]
     timing: Sequence[Row]
     note: str  # Markdown: what the run is, where it stands, and how it did
+    part: Part | None = None
 
     @property
     def key(self) -> str:
-        """`(32 hex digits)`: this run and no other, also when another one starts in its folder."""
-        identity = f"{self.ledger.folder.resolve()}\n{self.status.started_at!r}"
-        return hashlib.sha256(identity.encode()).hexdigest()[:32]
+        """`(32 hex digits)`: this run and no other. Outside grids, also when another one starts in its folder."""
+        if self.part is not None:
+            return self.part.key
+        return key_of(str(self.ledger.folder.resolve()), repr(self.status.started_at))
+
+    @property
+    def title(self) -> str:
+        """What the run is called in MLflow."""
+        return self.part.title if self.part is not None else f"{self.status.name}-s{self.status.seed}"
 
     @property
     def mlflow_status(self) -> str:
+        """RUNNING, FINISHED, FAILED or KILLED."""
+        if self.part is not None:
+            return self.part.ending
         if self.status.state == "running":
             return "RUNNING" if self.alive else "KILLED"
         return {"done": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}[self.status.state]
 
+    @property
+    def ended_at(self) -> float:
+        """Seconds since the epoch."""
+        return self.part.ended_at if self.part is not None else self.status.updated_at
 
-def _read(ledger: Ledger, status: Status, alive: bool, config: Mapping[str, Any]) -> _Snapshot:
+
+def key_of(*parts: str) -> str:
+    """`(32 hex digits)` by which something is found again."""
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+
+
+def read_snapshot(
+    ledger: Ledger, status: Status, alive: bool, config: Mapping[str, Any], part: Part | None = None
+) -> Snapshot:
+    """What of a run is to be mirrored now. Raises LedgerError if its files are damaged."""
     try:
         rows = ledger.rows(METRICS, committed_only=True)
         timing = ledger.rows(TIMING, committed_only=True)  # after the rows: it has one for each of them by now
@@ -175,10 +137,12 @@ def _read(ledger: Ledger, status: Status, alive: bool, config: Mapping[str, Any]
     if len(timing) < len(rows):
         raise LedgerError(f"{ledger.folder / TIMING} has {len(timing)} rows where {METRICS} has {len(rows)}")
     try:
-        note = _note(ledger, status, config, rows)
+        note = describe_run(ledger, status, config, rows)
     except (KeyError, TypeError, ValueError) as error:
         raise LedgerError(f"{ledger.folder / METRICS} has rows that this version cannot read: {error!r}") from None
-    return _Snapshot(ledger, status, alive, config, rows, timing, note)
+    if part is not None:
+        note += f"\n\n{part.remark}"
+    return Snapshot(ledger, status, alive, config, rows, timing, note, part)
 
 
 def _numbers(row: Row) -> Iterator[tuple[str, float]]:
@@ -194,7 +158,7 @@ def _numbers(row: Row) -> Iterator[tuple[str, float]]:
                 yield name, float(value)
 
 
-def _metrics(snapshot: _Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
+def _metrics(snapshot: Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
     """(rows complete once this is pushed, metric) from row `start` on, each row's own time and real step."""
     from mlflow.entities import Metric
 
@@ -211,34 +175,36 @@ def _metrics(snapshot: _Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
             yield index + (position + 1 == len(numbers)), Metric(name, value, milliseconds, steps)
 
 
-def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """`section.key` -> text; lists as JSON."""
     flat: dict[str, str] = {}
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
-            flat |= _flatten(value, f"{prefix}{key}.")
+            flat |= flatten(value, f"{prefix}{key}.")
         else:
             text = value if isinstance(value, str) else json.dumps(value, default=str)
             flat[f"{prefix}{key}"[:_MAX_KEY]] = text[:_MAX_PARAM]
     return flat
 
 
-def _tags(snapshot: _Snapshot) -> dict[str, str]:
+def _tags(snapshot: Snapshot) -> dict[str, str]:
     status = snapshot.status
     tags = {
         "space_dist.seed": str(status.seed),
         "space_dist.name": status.name,
         "space_dist.state": status.state,
+        STARTED_TAG: repr(status.started_at),
         "space_dist.folder": str(snapshot.ledger.folder),
         "space_dist.fingerprint_changed": str(status.fingerprint_changed).lower(),
         **{f"space_dist.fingerprint.{key}": str(value) for key, value in status.fingerprint.items()},
-        "mlflow.note.content": snapshot.note,
+        NOTE_TAG: snapshot.note,
+        **(snapshot.part.tags if snapshot.part is not None else {}),
     }
-    return {key: value[:_MAX_TAG] for key, value in tags.items()}
+    return {key: value[:MAX_TAG] for key, value in tags.items()}
 
 
-def _note(ledger: Ledger, status: Status, config: Mapping[str, Any], rows: Sequence[Row]) -> str:
-    flat = _flatten(config)
+def describe_run(ledger: Ledger, status: Status, config: Mapping[str, Any], rows: Sequence[Row]) -> str:
+    flat = flatten(config)
     what = " · ".join(flat[key] for key in ("curriculum.kind", "learner.kind", "env.id") if key in flat)
     lines = [
         f"**{status.name}**, seed {status.seed}: {what}",
@@ -264,63 +230,38 @@ def _shown(value: float | None) -> str:
 # ---- MLflow's side --------------------------------------------------------------------------------------------------
 
 
-class _Mirror:
-    """Pushes runs, and remembers which it left up to date, so that following many costs nothing while they rest."""
+@dataclass(frozen=True)
+class Child:
+    """What is known of a grid's run in MLflow."""
 
-    def __init__(self, uri: str | None, experiment: str | None) -> None:
-        self._uri = None if uri is None else _checked_uri(uri)
-        self._experiment = experiment
-        self._stores: dict[str, _Store] = {}
-        self._settled: dict[Path, tuple[Status, bool]] = {}
-
-    def push(self, ledgers: Sequence[Ledger]) -> SyncResult:
-        runs = created = rows = skipped = 0
-        failed: dict[Path, str] = {}
-        for ledger in ledgers:
-            try:
-                status, alive = ledger.status(), ledger.owner_alive()
-                if self._settled.get(ledger.folder) == (status, alive):
-                    runs += 1
-                    continue
-                config = _config(ledger)
-                target = self._target(config, ledger)
-                if target is None:
-                    skipped += 1
-                    continue
-                store, experiment = self._store(target[0]), target[1]
-                new, pushed = store.push(_read(ledger, status, alive, config), experiment)
-            except (LedgerError, _RefusedError) as error:
-                failed[ledger.folder] = str(error)
-                continue
-            runs, created, rows = runs + 1, created + new, rows + pushed
-            self._settled[ledger.folder] = (status, alive)
-        return SyncResult(runs, created, rows, skipped, failed)
-
-    def _target(self, config: Mapping[str, Any], ledger: Ledger) -> tuple[str, str] | None:
-        """(URI, experiment) for a run, None if it has no URI."""
-        tracking = config.get("tracking")
-        own: Mapping[str, Any] = tracking if isinstance(tracking, Mapping) else {}
-        uri = self._uri if self._uri is not None else own.get("uri")
-        experiment = self._experiment if self._experiment is not None else own.get("experiment")
-        if uri is None:
-            return None
-        if not isinstance(experiment, str):
-            raise LedgerError(f"{ledger.config} names no tracking.experiment; give one")
-        return (uri if self._uri is not None else _checked_uri(str(uri))), experiment
-
-    def _store(self, uri: str) -> _Store:
-        if uri not in self._stores:
-            with _store_errors(uri):
-                self._stores[uri] = _Store(uri)
-        return self._stores[uri]
+    run_id: str
+    stamp: str
+    ending: str
 
 
-class _RefusedError(Exception):
+@dataclass(frozen=True)
+class Parent:
+    """A grid as a run of its own.
+
+    key: `(32 hex digits)` by which it is found. tags: its description among them. table: results that are too long for
+    the description, in Markdown. Times are seconds since the epoch.
+    """
+
+    key: str
+    name: str
+    tags: Mapping[str, str]
+    table: str | None
+    ending: str
+    started_at: float
+    ended_at: float
+
+
+class RefusedError(Exception):
     """MLflow was reached and does not take this one run's content."""
 
 
-class _Store:
-    """One MLflow store. Methods raise TrackingError if it cannot be reached, _RefusedError for one bad run."""
+class Store:
+    """One MLflow store. Methods raise TrackingError if it cannot be reached, RefusedError for one bad run."""
 
     def __init__(self, uri: str) -> None:
         self._uri = uri
@@ -333,15 +274,86 @@ class _Store:
         else:
             self._client = _new_client(uri)
 
-    def push(self, snapshot: _Snapshot, experiment: str) -> tuple[bool, int]:
-        """(whether the run is new there, rows pushed)."""
-        with _store_errors(self._uri):
-            run, created = self._find_or_create(snapshot, self._experiment_id(experiment))
+    @contextlib.contextmanager
+    def exclusively(self, lock_file: Path | None = None) -> Iterator[None]:
+        """Be the only one that pushes: into an SQLite store, and of all who take `lock_file`. Waits for others.
+
+        Whoever dies lets go at once. What is found or not found meanwhile stays so.
+        """
+        with contextlib.ExitStack() as held:
+            if lock_file is not None:
+                held.enter_context(_locked(lock_file))
+            if self._uri.startswith("sqlite:"):
+                database = _database(self._uri)
+                held.enter_context(_locked(database.parent / f".{database.name}.pusher"))
+            yield
+
+    def push(
+        self, snapshot: Snapshot, experiment: str, run_id: str | None = None, *, known_new: bool = False
+    ) -> tuple[str, bool, int]:
+        """(id of the run there, whether it is new, rows pushed).
+
+        run_id: what it was when last seen. known_new: it need not be searched for.
+        """
+        with store_errors(self._uri):
+            run, created = self._find_or_create(snapshot, self._experiment_id(experiment), run_id, known_new)
             self._push_params(run, snapshot)
             pushed = self._push_rows(run, snapshot)
             self._push_standing(run, snapshot)
-            self._push_artifacts(run, snapshot)
-            return created, pushed
+            if snapshot.ledger.exists():  # of some attempts nothing is left but why they failed
+                self._push_artifacts(run, snapshot)
+            if snapshot.part is not None and run.data.tags.get(STAMP_TAG) != snapshot.part.stamp:
+                self._client.set_tag(run.info.run_id, STAMP_TAG, snapshot.part.stamp)  # last: all else is there
+            return str(run.info.run_id), created, pushed
+
+    def children(self, experiment: str, grid_key: str) -> dict[str, Child]:
+        """The runs of a grid that are there, by their key. Takes milliseconds for each, so it is asked once."""
+        found: dict[str, Child] = {}
+        with store_errors(self._uri):
+            experiment_id, page = self._experiment_id(experiment), None
+            while True:
+                runs = self._client.search_runs(
+                    [experiment_id], f"tags.`{GRID_TAG}` = '{grid_key}'", max_results=_PAGE, page_token=page
+                )
+                for run in runs:
+                    tags = run.data.tags
+                    child = Child(str(run.info.run_id), tags.get(STAMP_TAG, ""), str(run.info.status))
+                    key = tags.get(RUN_TAG, "")
+                    found[key] = min(child, found.get(key, child), key=lambda one: one.run_id)
+                page = runs.token
+                if not page:
+                    return found
+
+    def find_parent(self, key: str, experiment: str) -> str | None:
+        """The id of a grid's own run, if it is there."""
+        with store_errors(self._uri):
+            found = self._client.search_runs([self._experiment_id(experiment)], f"tags.`{RUN_TAG}` = '{key}'")
+            return min((str(run.info.run_id) for run in found), default=None)
+
+    def create_parent(self, parent: Parent, experiment: str) -> str:
+        """The id of a grid's own run, which is not there yet."""
+        with store_errors(self._uri):
+            tags = {RUN_TAG: parent.key, **parent.tags}
+            start = round(parent.started_at * 1000)
+            run = self._client.create_run(
+                self._experiment_id(experiment), start_time=start, tags=tags, run_name=parent.name
+            )
+            return str(run.info.run_id)
+
+    def push_parent(self, parent: Parent, run_id: str) -> None:
+        """Bring a grid's own run up to date."""
+        from mlflow.entities import RunTag
+
+        with store_errors(self._uri):
+            run = self._client.get_run(run_id)
+            changed = [RunTag(key, value) for key, value in parent.tags.items() if run.data.tags.get(key) != value]
+            for start in range(0, len(changed), _MAX_TAGS):
+                self._client.log_batch(run_id, tags=changed[start : start + _MAX_TAGS])
+            table = key_of(parent.table or "")
+            if parent.table is not None and run.data.tags.get(TABLE_TAG) != table:
+                self._client.log_text(run_id, parent.table, "results.md")
+                self._client.set_tag(run_id, TABLE_TAG, table)
+            self._push_ending(run, parent.ending, parent.ended_at)
 
     def _experiment_id(self, name: str) -> str:
         from mlflow.exceptions import MlflowException
@@ -368,28 +380,42 @@ class _Store:
         self._experiments[name] = identity
         return identity
 
-    def _find_or_create(self, snapshot: _Snapshot, experiment_id: str) -> tuple[MlflowRun, bool]:
-        found = self._client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{snapshot.key}'")
+    def _find_or_create(
+        self, snapshot: Snapshot, experiment_id: str, run_id: str | None, known_new: bool
+    ) -> tuple[MlflowRun, bool]:
+        found = [] if run_id is None else [self._client.get_run(run_id)]
+        found = [run for run in found if run.info.lifecycle_stage == "active"]
+        if not found and not known_new:
+            found = self._client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{snapshot.key}'")
         if found:
-            return min(found, key=lambda run: str(run.info.run_id)), False
+            run = min(found, key=lambda run: str(run.info.run_id))
+            if snapshot.part is None or not self._superseded(run, snapshot):
+                return run, False
+            self._client.delete_run(run.info.run_id)  # into MLflow's trash; points cannot be taken back singly
         status = snapshot.status
         run = self._client.create_run(
             experiment_id,
             start_time=round(status.started_at * 1000),
             tags={RUN_TAG: snapshot.key, **_tags(snapshot)},
-            run_name=f"{status.name}-s{status.seed}",
+            run_name=snapshot.title,
         )
         return run, True
 
-    def _push_params(self, run: MlflowRun, snapshot: _Snapshot) -> None:
+    @staticmethod
+    def _superseded(run: MlflowRun, snapshot: Snapshot) -> bool:
+        """Whether points are there of another run in the same folder, which was removed to start afresh."""
+        there = run.data.tags.get(ROWS_TAG, "0") != "0"
+        return there and run.data.tags.get(STARTED_TAG) != _tags(snapshot)[STARTED_TAG]
+
+    def _push_params(self, run: MlflowRun, snapshot: Snapshot) -> None:
         """Those that are not there yet: a param never changes, and a batch that was cut off is completed."""
         from mlflow.entities import Param
 
-        missing = [Param(key, value) for key, value in _flatten(snapshot.config).items() if key not in run.data.params]
+        missing = [Param(key, value) for key, value in flatten(snapshot.config).items() if key not in run.data.params]
         for start in range(0, len(missing), _MAX_PARAMS):
             self._client.log_batch(run.info.run_id, params=missing[start : start + _MAX_PARAMS])
 
-    def _push_rows(self, run: MlflowRun, snapshot: _Snapshot) -> int:
+    def _push_rows(self, run: MlflowRun, snapshot: Snapshot) -> int:
         from mlflow.entities import RunTag
 
         there = _whole_number(run.data.tags.get(ROWS_TAG, "0"))
@@ -410,7 +436,7 @@ class _Store:
             send(complete)
         return complete - there
 
-    def _push_artifacts(self, run: MlflowRun, snapshot: _Snapshot) -> None:
+    def _push_artifacts(self, run: MlflowRun, snapshot: Snapshot) -> None:
         """The config at once; all that makes a run reusable and readable when it is done."""
         ledger, before = snapshot.ledger, run.data.tags.get(ARTIFACTS_TAG)
         wanted = "done" if snapshot.status.state == "done" else "config"
@@ -430,25 +456,22 @@ class _Store:
             self._client.log_artifact(run.info.run_id, str(file))
         self._client.set_tag(run.info.run_id, ARTIFACTS_TAG, wanted)
 
-    def _push_standing(self, run: MlflowRun, snapshot: _Snapshot) -> None:
+    def _push_standing(self, run: MlflowRun, snapshot: Snapshot) -> None:
         """Tags and status, after the rows: nothing may look finished before its numbers are there."""
         from mlflow.entities import RunTag
 
         changed = [RunTag(key, value) for key, value in _tags(snapshot).items() if run.data.tags.get(key) != value]
         for start in range(0, len(changed), _MAX_TAGS):
             self._client.log_batch(run.info.run_id, tags=changed[start : start + _MAX_TAGS])
-        wanted, end = snapshot.mlflow_status, round(snapshot.status.updated_at * 1000)
+        self._push_ending(run, snapshot.mlflow_status, snapshot.ended_at)
+
+    def _push_ending(self, run: MlflowRun, wanted: str, ended_at: float) -> None:
+        end = round(ended_at * 1000)
         if wanted == "RUNNING":
             if run.info.status != wanted:
                 self._client.update_run(run.info.run_id, status=wanted)
         elif (run.info.status, run.info.end_time) != (wanted, end):
             self._client.set_terminated(run.info.run_id, wanted, end_time=end)
-
-
-def _config(ledger: Ledger) -> dict[str, Any]:
-    from space_dist.report import read_config  # here: it imports Matplotlib, which takes long
-
-    return read_config(ledger)
 
 
 def _draw(ledger: Ledger, folder: Path) -> list[Path]:
@@ -459,7 +482,7 @@ def _draw(ledger: Ledger, folder: Path) -> list[Path]:
     figures = {}
     if len(run.evaluation_steps):
         figures["learning_curve.png"] = draw_learning_curve(run)
-    if run.trained and not run.generates_contexts:
+    if len(run.set_sizes) and not run.generates_contexts:
         figures["curriculum.png"] = draw_curriculum(run)
     for name, figure in figures.items():
         save(figure, folder / name)
@@ -471,7 +494,7 @@ def _whole_number(text: str) -> int:
     return int(text) if re.fullmatch(r"[0-9]{1,15}", text) else 0
 
 
-def _checked_uri(uri: str) -> str:
+def checked_uri(uri: str) -> str:
     """The URI, with an absolute path if it is SQLite's. Raises ConfigError for a store that is not mirrored to."""
     try:
         parts = urlsplit(uri)
@@ -524,8 +547,26 @@ def _open_database(uri: str, database: Path) -> MlflowClient:
 
 
 @contextlib.contextmanager
-def _store_errors(uri: str) -> Iterator[None]:
-    """Run MLflow, and say what went wrong in our words. Raises TrackingError and _RefusedError."""
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file's lock, which the system takes back from whoever dies. Raises TrackingError if it cannot be had."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise TrackingError(f"cannot write {path}, by which pushers take turns: {error.strerror}") from None
+    with os.fdopen(descriptor) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            log.warning("waiting for another process that pushes at this moment (%s)", path)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:
+            raise TrackingError(f"cannot lock {path}, by which pushers take turns: {error.strerror}") from None
+        yield
+
+
+@contextlib.contextmanager
+def store_errors(uri: str) -> Iterator[None]:
+    """Run MLflow, and say what went wrong in our words. Raises TrackingError and RefusedError."""
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)  # MLflow reads some of them when it is imported: next
     import requests
@@ -536,7 +577,7 @@ def _store_errors(uri: str) -> Iterator[None]:
         yield
     except MlflowException as error:
         if error.error_code in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST"):
-            raise _RefusedError(f"MLflow at {uri} refuses it: {_first_line(error)}") from error
+            raise RefusedError(f"MLflow at {uri} refuses it: {_first_line(error)}") from error
         raise _unreachable(uri, error) from error
     except (SQLAlchemyError, sqlite3.Error, requests.RequestException, OSError) as error:
         raise _unreachable(uri, error) from error

@@ -1,0 +1,433 @@
+"""The report of a grid: its tables, figures and caveats in Markdown, in CSV, and as one HTML page."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from space_dist.config import clean
+from space_dist.errors import ConfigError
+from space_dist.ledger import atomic_write
+from space_dist.manifest import Grid, Manifest
+from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
+from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, draw_heat_map, draw_panels, png
+from space_dist.report.grid import (
+    CellRuns,
+    Comparison,
+    compare,
+    failures,
+    fingerprint_remarks,
+    grouped,
+    heat_maps,
+    missing,
+    pool,
+    read_cells,
+    run_folder,
+    varying,
+)
+from space_dist.report.load import Configuration
+from space_dist.report.statistics import RESAMPLES, Interval
+from space_dist.report.tables import (
+    NONE,
+    Value,
+    caveats,
+    interval_numbers,
+    interval_text,
+    number_text,
+    numbers,
+    reached_text,
+    size_text,
+    steps_text,
+    to_csv,
+)
+
+MAX_DRAWN: Final = 48  # cells with a learning curve
+MAX_LISTED: Final = 100  # failures, remarks
+_CURVES_PER_PANEL: Final = 6
+_METHOD: Final = tuple(
+    " ".join(paragraph.split())
+    for paragraph in f"""
+Round brackets say how many of a cell's seeds a number rests on: (9/10) are nine finished seeds of ten. Runs that are
+not finished count in no number.
+
+Final returns are undiscounted means over the held-out (test) instances at each finished run's last step. IQM:
+interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are 95 % percentile
+bootstraps with {RESAMPLES:,} resamples (scipy.stats.bootstrap). What is resampled are the seeds of a cell; where cells
+are pooled, those of each cell among themselves (stratified). With few seeds they are narrower than they should be; a
+single seed has none. A cell with a final return that is no number has none either.
+
+P(better) is the probability that a seed of the cell ends above a seed of the baseline, over all pairs of seeds, a tie
+counting one half; the seeds of both are resampled, each for itself.
+
+A threshold is reached at the first of three consecutive evaluations of the test return at or above it. Seeds that do
+not reach it within their budget are censored: they count as the budget in the restricted mean, which is a lower bound
+of the mean where seeds are censored. The ratio is the cell's restricted mean over the baseline's (0.5: in half of the
+steps), both up to the smaller budget; its seeds are resampled in pairs, and the threshold is held fixed. Untestable:
+the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound (mean + t s sqrt(1 + 1/n)) of
+one more untrained seed.
+
+Curves are IQMs over the finished seeds (while a cell has none, over unfinished ones, which its label says) with the
+same intervals as bands. Steps are real environment steps of training.""".split("\n\n")
+)
+
+
+@dataclass(frozen=True)
+class GridReport:
+    """What `build_grid_report` wrote into `folder`: report.md, report.html, cells.csv, runs.csv and PNG figures.
+
+    `summary` are sentences: how complete the grid is, and what cells are compared with. `table` has a dict (column ->
+    text) a cell, with the same columns in all; `remarks` are sentences that belong below it.
+    """
+
+    folder: Path
+    summary: list[str]
+    table: list[dict[str, str]]
+    remarks: list[str]
+    markdown: str
+
+
+def build_grid_report(
+    grid: Grid, out: Path | None = None, *, baseline: str | None = None, threshold: float | None = None
+) -> GridReport:
+    """Report on a grid as it stands, finished or not; `out` is by default `report` in the grid's folder.
+
+    baseline: label of a cell, or the start of its id; None: the manifest's. threshold: a test return; None: the
+    baseline's final IQM. Raises ConfigError for an unknown baseline, a threshold that is no finite number, or if `out`
+    cannot be written to; LedgerError if the manifest is missing or damaged.
+    """
+    if threshold is not None and not math.isfinite(threshold):
+        raise ConfigError(f"--threshold must be a finite number, not {threshold}")
+    manifest = grid.manifest()
+    chosen = manifest.baseline if baseline is None else manifest.cell(baseline).id
+    folder = grid.folder / "report" if out is None else out
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # before the work, which takes a while for a large grid
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    cells = read_cells(grid, manifest)
+    reference = next((cell for cell in cells if cell.cell.id == chosen), None)
+    if reference is None:
+        raise ConfigError(f"{grid.manifest_file} names a baseline {chosen!r} that is none of its cells")
+    compared = compare(cells, reference, threshold)
+
+    summary = _summary(manifest, cells, reference, compared, threshold)
+    remarks = _remarks(manifest, cells, compared)
+    finals = _finals(cells, compared)
+    sections = [
+        Section("", summary),
+        Section("Final return on the held-out instances", rows=finals),
+        *_failed(cells),
+        *_curves(cells, reference),
+    ]
+    if any(cell.summary.n_finished for cell in cells):
+        sections += [
+            Section("Steps to the threshold", rows=[_steps_row(*pair) for pair in zip(cells, compared, strict=True)]),
+            *_maps(cells),
+            *_pooled(cells),
+            Section("Training", rows=[_training_row(cell) for cell in cells]),
+        ]
+    sections += [Section("Remarks", items=remarks)] if remarks else []
+    document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
+    markdown = to_markdown(document)
+    files = {
+        **{picture.file: picture.png for section in document.sections for picture in section.pictures},
+        "cells.csv": to_csv([_numbers(*pair) for pair in zip(cells, compared, strict=True)]).encode(),
+        "runs.csv": to_csv(_run_numbers(grid, cells)).encode(),
+        "report.md": markdown.encode(),
+        "report.html": to_html(document).encode(),
+    }
+    try:
+        for name, content in files.items():
+            atomic_write(folder / name, content)
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    table = [
+        _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
+    ]
+    return GridReport(folder, summary, table, remarks, markdown)
+
+
+def _unwritable(folder: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}")
+
+
+# ---- sentences ------------------------------------------------------------------------------------------------------
+
+
+def _summary(
+    manifest: Manifest, cells: Sequence[CellRuns], baseline: CellRuns, compared: Sequence[Comparison],
+    threshold: float | None,
+) -> list[str]:  # fmt: skip
+    counts = Counter(standing.condition for cell in cells for standing in cell.standings)
+    n_runs, done = counts.total(), counts.pop("done", 0)
+    size = (
+        f"{len(cells):,} cell{'s' if len(cells) > 1 else ''} × {len(manifest.seeds):,} "
+        f"seed{'s' if len(manifest.seeds) > 1 else ''}"
+    )
+    rest = ", ".join(f"{count:,} {condition}" for condition, count in sorted(counts.items()))
+    if not done:
+        return [
+            f"No run of this grid has finished yet, so there is no number to report: of its {n_runs:,} runs ({size}), "
+            f"{rest}."
+        ]
+    every = "All" if done == n_runs else f"{done:,} of"
+    sentences = [f"{every} {n_runs:,} runs are finished ({size}){f'; {rest}' if rest else ''}."]
+    level = compared[cells.index(baseline)].threshold
+    others = len({cell.task for cell in cells}) > 1
+    counterparts = "; in other environments or test sets, its counterpart there" if others else ""
+    source = "the baseline's final IQM" if threshold is None else "as asked for"
+    sentences.append(
+        f"Baseline: {baseline.label}{counterparts}. Threshold of the test return: "
+        + (f"{number_text(level)} ({source})." if not math.isnan(level) else "none, for the baseline has no final IQM.")
+    )
+    return sentences
+
+
+def _remarks(manifest: Manifest, cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[str]:
+    lines = fingerprint_remarks(cells, manifest)
+    if alone := [cell.label for cell, comparison in zip(cells, compared, strict=True) if comparison.reference is None]:
+        shown = ", ".join(alone[:MAX_LISTED]) + (", ..." if len(alone) > MAX_LISTED else "")
+        lines.append(f"Not compared, for their environment or test set has no counterpart of the baseline: {shown}.")
+    peculiar = [line for cell in cells for line in caveats(cell.configuration)]
+    more = [f"{len(peculiar) - MAX_LISTED:,} more remarks of this kind."] if len(peculiar) > MAX_LISTED else []
+    return lines + peculiar[:MAX_LISTED] + more
+
+
+# ---- tables ---------------------------------------------------------------------------------------------------------
+
+
+def _with_seeds(text: str, n: int, of: int, what: str = "") -> str:
+    return f"{text} ({n}/{of}{what})"
+
+
+def _name(cell: CellRuns, comparison: Comparison) -> str:
+    return f"{cell.label} (baseline)" if comparison.reference is cell else cell.label
+
+
+def _finals(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[dict[str, str]]:
+    rows = []
+    for cell, comparison in zip(cells, compared, strict=True):
+        test, of = cell.summary.test, cell.summary.n_runs
+        rows.append(
+            {
+                "cell": _name(cell, comparison),
+                "seeds finished": f"{cell.summary.n_finished}/{of}",
+                "not finished": missing(cell) or NONE,
+                "IQM [95 %]": _with_seeds(interval_text(test.iqm), test.n, of),
+                "mean [95 %]": _with_seeds(interval_text(test.mean), test.n, of),
+                "median [95 %]": _with_seeds(interval_text(test.median), test.n, of),
+                "P(better) [95 %]": _improvement(cell, comparison),
+            }
+        )
+    return rows
+
+
+def _improvement(cell: CellRuns, comparison: Comparison) -> str:
+    if comparison.improvement is None or comparison.reference is None:
+        return NONE
+    theirs = comparison.reference.summary
+    text = interval_text(comparison.improvement, 2)
+    return _with_seeds(text, cell.summary.test.n, cell.summary.n_runs, f" against {theirs.test.n}/{theirs.n_runs}")
+
+
+def _steps_row(cell: CellRuns, comparison: Comparison) -> dict[str, str]:
+    reach, of = comparison.reach, cell.summary.n_runs
+    row = {"cell": _name(cell, comparison), "threshold": number_text(comparison.threshold)}
+    if reach is None:
+        return row | {"reached by": NONE, "censored": NONE, "steps, restricted mean [95 %]": comparison.untestable,
+                      "ratio to the baseline [95 %]": NONE}  # fmt: skip
+    n = len(reach.times)
+    row["reached by"] = f"{n - reach.censored}/{n}"
+    row["censored"] = f"{reach.censored}/{n} at {reach.budget:,} steps" if reach.censored else f"0/{n}"
+    row["steps, restricted mean [95 %]"] = _with_seeds(interval_text(reach.mean, 0), n, of)
+    row["ratio to the baseline [95 %]"] = _ratio(comparison, of)
+    return row
+
+
+def _ratio(comparison: Comparison, n_seeds: int) -> str:
+    if comparison.ratio is None:
+        return NONE
+    return _with_seeds(interval_text(comparison.ratio, 2), comparison.pairs, n_seeds, " pairs")
+
+
+def _training_row(cell: CellRuns) -> dict[str, str]:
+    found, of = cell.summary, cell.summary.n_runs
+    done = found.n_finished
+    return {
+        "cell": cell.label,
+        "environment steps": _with_seeds(steps_text(found), done, of),
+        "train return, IQM [95 %]": _with_seeds(interval_text(found.train.iqm), found.train.n, of),
+        "test success": _with_seeds(number_text(found.test_success), found.test.n, of),
+        "set size at the end": _with_seeds(size_text(found), done, of),
+        "all instances reached": _with_seeds(reached_text(found), done, of),
+    }
+
+
+def _short_row(cell: CellRuns, comparison: Comparison, final: dict[str, str]) -> dict[str, str]:
+    """For a terminal."""
+    steps = comparison.untestable.partition(":")[0]
+    if comparison.reach is not None:
+        reach = comparison.reach
+        steps = f"{interval_text(reach.mean, 0)}, {reach.censored}/{len(reach.times)} censored"
+    return {
+        "cell": final["cell"],
+        "seeds": final["seeds finished"],
+        "not finished": final["not finished"],
+        "test return, IQM [95 %]": final["IQM [95 %]"],
+        "P(better)": final["P(better) [95 %]"],
+        "steps to the threshold": steps,
+        "ratio": _ratio(comparison, cell.summary.n_runs),
+    }
+
+
+def _failed(cells: Sequence[CellRuns]) -> list[Section]:
+    found = failures(cells)
+    if not found:
+        return []
+    causes = Counter(standing.cause.in_words if standing.cause else "unknown" for _, standing in found)
+    text = [f"{len(found):,} run{'s' if len(found) > 1 else ''} failed and "
+            f"{'are' if len(found) > 1 else 'is'} in no number: "
+            + ", ".join(f"{count:,} {cause}" for cause, count in causes.most_common()) + "."]  # fmt: skip
+    if len(found) > MAX_LISTED:
+        text.append(f"The first {MAX_LISTED} follow; runs.csv lists every one.")
+    rows, details = [], []
+    for cell, standing in found[:MAX_LISTED]:
+        title = f"{cell.label}, seed {standing.run.seed}"
+        lines = [clean(line) for line in standing.detail.splitlines() if line.strip()] or [""]
+        rows.append(
+            {
+                "run": title,
+                "cause": standing.cause.in_words if standing.cause else "unknown",
+                "what it said": lines[0] or NONE,
+                "steps": f"{standing.steps:,} of {standing.budget_steps:,}",
+                "attempts": str(standing.attempts),
+            }
+        )
+        details += [(f"{title}: all it said", "\n".join(lines))] if len(lines) > 1 else []
+    return [Section("Failed runs", text, rows, details=details, words=True)]
+
+
+def _pooled(cells: Sequence[CellRuns]) -> list[Section]:
+    rows = [
+        {"setting": found.setting, "cells": f"{found.n_cells}",
+         "test return, IQM [95 %]": _with_seeds(interval_text(found.iqm), found.n_finished, found.n_runs, " runs")}
+        for found in pool(cells)
+    ]  # fmt: skip
+    text = ("The final test return of all cells with a setting, whatever their others; the intervals are stratified by "
+            "cell. Settings whose cells differ in other ways too, or in how many runs are finished, are no fair "
+            "comparison.")  # fmt: skip
+    return [Section("One setting at a time", [text], rows)] if rows else []
+
+
+# ---- figures --------------------------------------------------------------------------------------------------------
+
+
+def _curves(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Section]:
+    drawn = [cell for cell in cells if cell.configuration.drawn]
+    text = []
+    if len(drawn) > MAX_DRAWN:
+        text.append(f"Of {len(drawn):,} cells, the {MAX_DRAWN} of the highest final IQM are drawn, best first, and the "
+                    "baseline.")  # fmt: skip
+        drawn = sorted(drawn, key=_descending)[:MAX_DRAWN]
+    if not drawn:
+        return []
+    if len(drawn) <= len(COLOURS):
+        figure = draw_comparison([cell.configuration for cell in drawn])
+        caption = "Test return, train return and size of the training set over environment steps"
+    else:
+        figure = draw_panels(_panels(drawn, baseline))
+        caption = "Test return over environment steps (IQM over seeds, 95 % interval); grey: the baseline"
+    return [Section("Learning curves", text, pictures=[Picture("curves.png", caption, png(figure))])]
+
+
+def _descending(cell: CellRuns) -> float:
+    value = cell.summary.test.iqm.value
+    return math.inf if math.isnan(value) else -value
+
+
+def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
+    """Cells that differ only by the grid's last setting in one panel, where that is few enough; else six and six."""
+    keys = varying(cells)
+    groups = grouped(cells, keys[:-1])
+    if max(map(len, groups.values())) > _CURVES_PER_PANEL or len(groups) * 2.5 > len(cells):
+        parts = {at: list(cells[at : at + _CURVES_PER_PANEL]) for at in range(0, len(cells), _CURVES_PER_PANEL)}
+        groups = {(f"cells {at + 1} to {at + len(part)}",): part for at, part in parts.items()}
+
+    def curves(members: Sequence[CellRuns]) -> list[Configuration]:
+        return [cell.configuration for cell in members if cell is not baseline]
+
+    reference = baseline.configuration if baseline.configuration.drawn else None
+    return [Panel(", ".join(place), curves(members), reference if members[0].task == baseline.task else None)
+            for place, members in groups.items() if curves(members)]  # fmt: skip
+
+
+def _maps(cells: Sequence[CellRuns]) -> list[Section]:
+    maps = [found for found in heat_maps(cells) if not all(math.isnan(value) for value in found.means.flat)]
+    shown = [value for found in maps for value in found.means.flat if not math.isnan(value)]
+    text = "Final test return: mean ± standard deviation over the finished seeds, as in the paper's Table 1."
+    sections = []
+    for number, found in enumerate(maps, start=1):
+        title = "Two parameters" + (f": {found.title}" if found.title else "")
+        picture = Picture(f"heat_map_{number}.png", f"{found.column_name} and {found.row_name}: mean final test return",
+                          png(draw_heat_map(found, min(shown), max(shown))))  # fmt: skip
+        sections.append(Section(title, [text], _map_rows(found), pictures=[picture]))
+    return sections
+
+
+def _map_rows(found: HeatMap) -> list[dict[str, str]]:
+    head = f"{found.row_name} \\ {found.column_name}"
+    return [
+        {head: name, **{f"{found.column_name}={value}": found.text(row, column)
+                        for column, value in enumerate(found.columns)}}
+        for row, name in enumerate(found.rows)
+    ]  # fmt: skip
+
+
+# ---- numbers in full precision --------------------------------------------------------------------------------------
+
+
+def _numbers(cell: CellRuns, comparison: Comparison) -> dict[str, Value]:
+    reach, none = comparison.reach, Interval(math.nan)
+    reference = comparison.reference
+    return {
+        "cell": cell.cell.id,
+        **numbers(cell.summary),
+        "not_finished": missing(cell),
+        "baseline": None if reference is None else reference.cell.id,
+        **interval_numbers("probability_of_improvement", comparison.improvement or none),
+        "baseline_return_seeds": None if reference is None else reference.summary.test.n,
+        "threshold": comparison.threshold,
+        "steps_seeds": None if reach is None else len(reach.times),
+        "steps_censored": None if reach is None else reach.censored,
+        **interval_numbers("steps_restricted_mean", none if reach is None else reach.mean),
+        **interval_numbers("steps_ratio", comparison.ratio or none),
+        "steps_ratio_pairs": comparison.pairs,
+        "steps_untestable": comparison.untestable,
+    }
+
+
+def _run_numbers(grid: Grid, cells: Sequence[CellRuns]) -> list[dict[str, Value]]:
+    """A row a run, those that left nothing included."""
+    fields = sorted({field for cell in cells for run in cell.configuration.runs for field in run.status.fingerprint})
+    rows = []
+    for cell in cells:
+        read = {run.status.seed: run for run in cell.configuration.runs}
+        for standing in cell.standings:
+            run = read.get(standing.run.seed)
+            last = run if run is not None and len(run.evaluation_steps) else None
+            row: dict[str, Value] = {
+                "cell": cell.cell.id, "label": cell.label, "seed": standing.run.seed, "condition": standing.condition,
+                "cause": standing.cause, "detail": " / ".join(clean(line) for line in standing.detail.splitlines()),
+                "attempts": standing.attempts, "steps": standing.steps, "budget_steps": standing.budget_steps,
+                "last_test_return": None if last is None else last.final("test", "return"),
+                "last_train_return": None if last is None else last.final("train", "return"),
+                "fingerprint_changed": None if run is None else str(run.status.fingerprint_changed).lower(),
+                "folder": run_folder(grid, standing),
+            }  # fmt: skip
+            rows.append(row | {field: None if run is None else clean(str(run.status.fingerprint.get(field, "")))
+                               for field in fields})  # fmt: skip
+    return rows

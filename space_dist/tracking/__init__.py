@@ -1,0 +1,295 @@
+"""MLflow as a mirror: committed rows of ledgers are replayed into experiments. The only importer of MLflow.
+
+    experiment -> one run for each run outside grids
+               -> one parent run for each grid -> one child for each of its runs that has begun
+
+Every one is found by its tag `space_dist.run` before it is created, and pushing twice changes nothing: whatever MLflow
+loses or misses is pushed again from the ledgers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from pathlib import Path
+from typing import Any, Final
+
+from space_dist.errors import LedgerError
+from space_dist.ledger import Ledger, Status
+from space_dist.manifest import CELL_ID_DIGITS, MANIFEST, Grid
+from space_dist.tracking.grids import GridMirror
+from space_dist.tracking.runs import (
+    GRID_TAG,
+    NOTE_TAG,
+    ROWS_TAG,
+    RUN_TAG,
+    RefusedError,
+    Store,
+    TrackingError,
+    checked_uri,
+    read_snapshot,
+    store_errors,
+)
+
+__all__ = [
+    "GRID_TAG", "NOTE_TAG", "ROWS_TAG", "RUN_TAG", "Found", "SyncResult", "TrackingError", "find", "follow", "sync",
+]  # fmt: skip
+
+log = logging.getLogger(__name__)
+
+_LOOK_SECONDS: Final = 0.25  # a follower that looks at its files for longer than this does so less often
+_STATUS: Final = "status.json"
+_CELL: Final = re.compile(rf"[0-9a-f]{{{CELL_ID_DIGITS}}}")
+
+
+@dataclass(frozen=True)
+class SyncResult:
+    """What a `sync` did.
+
+    `runs` were brought up to date, `created` of them newly; `rows` of metrics.jsonl were pushed; `skipped` runs have
+    no tracking URI. A grid's runs that have not begun do not count. `failed` names, by folder, the runs that could not
+    be mirrored because their ledger is damaged or MLflow refused their content: whoever calls must show them.
+    """
+
+    runs: int = 0
+    created: int = 0
+    rows: int = 0
+    skipped: int = 0
+    failed: Mapping[Path, str] = dataclass_field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Grids, and runs that belong to none."""
+
+    ledgers: tuple[Ledger, ...] = ()
+    grids: tuple[Grid, ...] = ()
+
+
+def find(paths: Iterable[Path]) -> Found:
+    """Every run and grid in, below and around `paths`, in order, each once; a grid stands for all its runs.
+
+    Raises LedgerError for a path without any.
+    """
+    ledgers: dict[Path, Ledger] = {}
+    grids: dict[Path, Grid] = {}
+    for path in paths:
+        if not path.exists():
+            raise LedgerError(f"{path} does not exist")
+        before = len(ledgers) + len(grids)
+        if around := _grid_around(path.resolve()):
+            grids[around] = Grid(around)
+            continue
+        hit = False
+        for folder, below, files in os.walk(path):
+            if MANIFEST in files or _STATUS in files:
+                below.clear()  # neither holds another one
+                hit = True
+                where = Path(folder).resolve()
+                if MANIFEST in files:
+                    grids[where] = Grid(folder)
+                else:
+                    ledgers[where] = Ledger(folder)
+        if not hit and len(ledgers) + len(grids) == before:
+            raise LedgerError(f"no run found in {path}: no folder there has a {_STATUS} or {MANIFEST}")
+    return Found(tuple(ledgers[key] for key in sorted(ledgers)), tuple(grids[key] for key in sorted(grids)))
+
+
+def _grid_around(path: Path) -> Path | None:
+    """The folder of the grid that a cell's or a run's folder belongs to."""
+    for folder in (path, path.parent):
+        if _CELL.fullmatch(folder.name) and (folder.parent / MANIFEST).is_file():
+            return folder.parent
+    return None
+
+
+def sync(
+    ledgers: Sequence[Ledger], uri: str | None = None, experiment: str | None = None, *, grids: Sequence[Grid] = ()
+) -> SyncResult:
+    """Bring MLflow up to date with the committed rows of the runs and grids. Doing it again changes nothing.
+
+    `uri` and `experiment` default to each run's own (`tracking.uri`, `tracking.experiment` of its config), or to its
+    grid's. A run that was deleted in MLflow is replayed afresh.
+
+    Raises ConfigError for a URI or experiment that cannot be used, TrackingError if a store cannot be reached.
+    """
+    return _Mirror(uri, experiment).push(Found(tuple(ledgers), tuple(grids)))
+
+
+def follow(
+    root: Path | Sequence[Path],
+    uri: str | None = None,
+    experiment: str | None = None,
+    poll_seconds: float = 5.0,
+    *,
+    stop: Callable[[], bool] | None = None,
+) -> SyncResult:
+    """Keep MLflow up to date with all runs and grids in and below `root` until `stop()` is true, then push a last time.
+
+    Without `stop`, that is when nobody works on the grids any more and no run is alive: whoever starts a follower holds
+    the grid's or the run's lock by then.
+
+    Runs may appear later. While a store cannot be reached nothing is lost: it is logged once, and once more when it is
+    back. Returns the sum of what was done, `failed` as of the last push.
+
+    Raises ConfigError as `sync` does, and TrackingError if the last push fails.
+    """
+    mirror = _Mirror(uri, experiment)
+    roots = [root] if isinstance(root, Path) else list(root)
+    total, failed, unreachable = SyncResult(), dict[Path, str](), False
+    found = _find_so_far(roots)
+    while True:
+        last = not mirror.anyone_works(found) if stop is None else stop()
+        looked = time.monotonic()
+        found = _find_so_far(roots)
+        looking = time.monotonic() - looked
+        try:
+            done = mirror.push(found)
+        except TrackingError as error:
+            if last:
+                raise
+            if not unreachable:
+                log.warning("%s", error)
+            unreachable = True
+        else:
+            if unreachable:
+                log.warning("MLflow can be reached again")
+            unreachable = False
+            for folder, reason in done.failed.items():
+                if failed.get(folder) != reason:
+                    log.warning("%s is not mirrored: %s", folder, reason)
+            failed = dict(done.failed)
+            total = SyncResult(
+                done.runs, total.created + done.created, total.rows + done.rows, done.skipped, done.failed
+            )
+            if stop is None and mirror.saw_life:  # it began meanwhile
+                last = False
+        if last:
+            return total
+        until = time.monotonic() + poll_seconds * max(1.0, (looking + mirror.looking_seconds) / _LOOK_SECONDS)
+        while (left := until - time.monotonic()) > 0:
+            if not mirror.anyone_works(found) if stop is None else stop():
+                break
+            time.sleep(min(left, 0.2))
+
+
+def _find_so_far(roots: Sequence[Path]) -> Found:
+    ledgers: dict[Path, Ledger] = {}
+    grids: dict[Path, Grid] = {}
+    for root in roots:
+        with contextlib.suppress(LedgerError):  # no run there yet
+            here = find([root])
+            ledgers |= {ledger.folder.resolve(): ledger for ledger in here.ledgers}
+            grids |= {grid.folder.resolve(): grid for grid in here.grids}
+    return Found(tuple(ledgers.values()), tuple(grids.values()))
+
+
+class _Mirror:
+    """Pushes runs and grids, and remembers what it left up to date: following many costs nothing while they rest.
+
+    saw_life: whether a run was alive when last looked at. looking_seconds: what that took for the grids.
+    """
+
+    def __init__(self, uri: str | None, experiment: str | None) -> None:
+        self._uri = None if uri is None else checked_uri(uri)
+        self._experiment = experiment
+        self._stores: dict[str, Store] = {}
+        self._settled: dict[Path, tuple[Status, bool]] = {}
+        self._grids: dict[Path, GridMirror] = {}
+        self.saw_life = False
+        self.looking_seconds = 0.0
+
+    def anyone_works(self, found: Found) -> bool:
+        """Whether a grid is being worked on, or a run seen alive still is. Costs little, since one is enough."""
+        return any(grid.owner_alive() or self._grid(grid).any_alive() for grid in found.grids) or any(
+            ledger.owner_alive() for ledger in found.ledgers
+        )
+
+    def push(self, found: Found) -> SyncResult:
+        self.saw_life, self.looking_seconds = False, 0.0
+        total = self._push_runs(found.ledgers)
+        for grid in found.grids:
+            done = self._push_grid(grid)
+            total = SyncResult(
+                total.runs + done.runs, total.created + done.created, total.rows + done.rows,
+                total.skipped + done.skipped, {**total.failed, **done.failed},
+            )  # fmt: skip
+        return total
+
+    def _push_runs(self, ledgers: Sequence[Ledger]) -> SyncResult:
+        runs = created = rows = skipped = 0
+        failed: dict[Path, str] = {}
+        for ledger in ledgers:
+            try:
+                status, alive = ledger.status(), ledger.owner_alive()
+                self.saw_life |= alive
+                if self._settled.get(ledger.folder) == (status, alive):
+                    runs += 1
+                    continue
+                config = _config(ledger)
+                target = self._target(config, ledger)
+                if target is None:
+                    skipped += 1
+                    continue
+                store, experiment = self._store(target[0]), target[1]
+                with store.exclusively():
+                    _, new, pushed = store.push(read_snapshot(ledger, status, alive, config), experiment)
+            except (LedgerError, RefusedError) as error:
+                failed[ledger.folder] = str(error)
+                continue
+            runs, created, rows = runs + 1, created + new, rows + pushed
+            self._settled[ledger.folder] = (status, alive)
+        return SyncResult(runs, created, rows, skipped, failed)
+
+    def _push_grid(self, grid: Grid) -> SyncResult:
+        mirror, before = self._grid(grid), time.monotonic()
+        try:
+            manifest = mirror.look()
+        except LedgerError as error:
+            return SyncResult(failed={grid.folder: str(error)})
+        self.looking_seconds += time.monotonic() - before
+        self.saw_life |= mirror.saw_life
+        uri = self._uri if self._uri is not None else manifest.tracking.uri
+        if uri is None:
+            return SyncResult(skipped=mirror.begun)
+        created = rows = 0
+        if mirror.changed:
+            store = self._store(uri if self._uri is not None else checked_uri(uri))
+            try:
+                created, rows = mirror.push(manifest, store, self._experiment or manifest.experiment)
+            except RefusedError as error:
+                return SyncResult(failed={grid.folder: str(error)})
+        return SyncResult(mirror.begun - len(mirror.failed), created, rows, 0, mirror.failed)
+
+    def _grid(self, grid: Grid) -> GridMirror:
+        return self._grids.setdefault(grid.folder, GridMirror(grid))
+
+    def _target(self, config: Mapping[str, Any], ledger: Ledger) -> tuple[str, str] | None:
+        """(URI, experiment) for a run, None if it has no URI."""
+        tracking = config.get("tracking")
+        own: Mapping[str, Any] = tracking if isinstance(tracking, Mapping) else {}
+        uri = self._uri if self._uri is not None else own.get("uri")
+        experiment = self._experiment if self._experiment is not None else own.get("experiment")
+        if uri is None:
+            return None
+        if not isinstance(experiment, str):
+            raise LedgerError(f"{ledger.config} names no tracking.experiment; give one")
+        return (uri if self._uri is not None else checked_uri(str(uri))), experiment
+
+    def _store(self, uri: str) -> Store:
+        if uri not in self._stores:
+            with store_errors(uri):
+                self._stores[uri] = Store(uri)
+        return self._stores[uri]
+
+
+def _config(ledger: Ledger) -> dict[str, Any]:
+    from space_dist.report import read_config  # here: it imports Matplotlib, which takes long
+
+    return read_config(ledger)

@@ -1,0 +1,544 @@
+"""Grids: the file, the manifest, cell ids, and where runs stand."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from space_dist import config as configs
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.grid import Conductor, plan
+from space_dist.ledger import METRICS, Lock, Row
+from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
+from space_dist.provenance import source_digest
+from space_dist.standing import Attempts, Cause, Ended, exit_code, last_lines, standing_of, standings
+from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
+
+CODE = "0" * 16
+
+
+def refusal(folder: Path, **sections: Any) -> str:
+    with pytest.raises(ConfigError) as caught:
+        plan(write_grid(folder, **sections), folder / "runs")
+    return str(caught.value)
+
+
+def ids(folder: Path, **sections: Any) -> list[str]:
+    folder.mkdir(exist_ok=True, parents=True)
+    return [cell.id for cell in plan(write_grid(folder, **sections), folder / "runs").manifest.cells]
+
+
+# ---- the file -------------------------------------------------------------------------------------------------------
+
+
+def test_cells_are_products_and_zips_without_what_is_excluded(tmp_path: Path) -> None:
+    made = plan(
+        write_grid(
+            tmp_path,
+            grid={"curriculum.kappa": [1, 4], "curriculum.eta": [0.05, 0.1]},
+            zip={"learner.gamma": [0.9, 0.95], "learner.gae_lambda": [0.8, 0.99]},
+            exclude=[{"curriculum.kappa": 4, "curriculum.eta": 0.05}, {"learner.gamma": 0.9, "curriculum.kappa": 1}],
+            seeds={"start": 5, "count": 3},
+        ),
+        tmp_path / "runs",
+    )  # fmt: skip
+    settings = [tuple(cell.settings[axis] for axis in made.manifest.axes) for cell in made.manifest.cells]
+    assert made.manifest.axes == ("learner.gamma", "learner.gae_lambda", "curriculum.kappa", "curriculum.eta")
+    assert settings == [(0.9, 0.8, 4, 0.1), (0.95, 0.99, 1, 0.05), (0.95, 0.99, 1, 0.1), (0.95, 0.99, 4, 0.1)]
+    assert [run.seed for run in made.manifest.runs()] == [5] * 4 + [6] * 4 + [7] * 4
+    assert made.manifest.cells[0].label == "gamma=0.9 gae_lambda=0.8 kappa=4 eta=0.1"
+    assert made.steps == 12 * 2048
+    config = made.grid.run_config(made.manifest, made.manifest.runs()[0])
+    assert (config.learner.gamma, config.seed, config.tracking.live) == (0.9, 5, False)
+
+
+def test_several_bases_and_whole_sections_are_axes(tmp_path: Path) -> None:
+    bases = [str(SPACE), str(ROOT / "configs/pointmass_round_robin.yaml")]
+    made = plan(write_grid(tmp_path, extends=bases, grid={"learner.gamma": [0.9]}), tmp_path / "runs").manifest
+    assert [cell.label for cell in made.cells] == ["pointmass_space gamma=0.9", "pointmass_round_robin gamma=0.9"]
+    assert made.baseline == made.cells[1].id
+    sections = [{"kind": "space", "eta": 0.05}, {"kind": "random_growth"}, {"kind": "fixed", "ids": [1, 2]}]
+    made = plan(write_grid(tmp_path, grid={"curriculum": sections}), tmp_path / "runs").manifest
+    assert [cell.label for cell in made.cells] == ["space eta=0.05", "random_growth", "fixed ids=[1,2]"]
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"grid": {"curriculum.kapa": [1]}}, ("curriculum.kapa", "did you mean 'kappa'", "cell")),
+        ({"grid": {"curriculum.kappa": []}}, ("curriculum.kappa", "at least one value")),
+        ({"grid": {"curriculum.kappa": 3}}, ("curriculum.kappa", "list")),
+        ({"grid": {"seed": [1, 2]}}, ("grid.seed", "'seeds'")),
+        ({"set": {"tracking.uri": None, "name": "x"}}, ("set.tracking.uri", "'tracking'")),
+        ({"zip": {"learner.gamma": [0.9], "learner.gae_lambda": [0.8, 0.9]}}, ("equally long", "gamma 1")),
+        ({"zip": {"curriculum.kappa": [0.9]}}, ("curriculum.kappa", "twice")),
+        ({"exclude": [{"curriculum.kappa": 3}]}, ("exclude", "matches no cell")),
+        ({"exclude": [{"curriculum.kapa": 1}]}, ("curriculum.kapa", "did you mean 'curriculum.kappa'")),
+        ({"exclude": [{"curriculum.kappa": 1}, {"curriculum.kappa": 4}]}, ("leaves no cell",)),
+        ({"grid": {"curriculum.kappa": [1, 1]}}, ("same run config",)),
+        ({"seeds": [1, 1]}, ("seeds", "once")),
+        ({"seeds": {"count": 0}}, ("seeds", "greater than or equal to 1")),
+        ({"seeds": {"count": 60000}}, ("more than 100,000 runs",)),
+        ({"name": "../x"}, ("name",)),
+        ({"nme": "x"}, ("nme", "did you mean 'name'")),
+        ({"extends": "nowhere.yaml"}, ("nowhere.yaml", "does not exist")),
+        ({"baseline": {"curriculum.kappa": 9}}, ("baseline", "0 cells")),
+        ({"retry": {"config_error": 1}}, ("retry.config_error", "unknown key")),
+        ({"resources": {"memory_mb": 1}}, ("resources.memory_mb",)),
+        ({"tracking": {"uri": "file:///x"}}, ("tracking.uri", "sqlite")),
+        ({"grid": {"rollout.shards": [3]}}, ("n_steps", "multiple")),
+        ({"set": {"budget.steps": 100}}, ("budget.steps",)),
+        ({"set": {**SMALL, "instances.train": "gone.csv"}}, ("gone.csv", "instances.train")),
+    ],
+)  # fmt: skip
+def test_faults_are_named(sections: dict[str, Any], words: tuple[str, ...], tmp_path: Path) -> None:
+    text = refusal(tmp_path, **sections)
+    assert all(word in text for word in words), text
+    assert "grid.yaml" in text or "nowhere.yaml" in text
+    assert len(text) < 3000
+    assert not list(tmp_path.glob("runs/*/manifest.json"))
+
+
+def test_every_field_of_a_grid_is_explained() -> None:
+    for model in [GridConfig, *(field.annotation for field in GridConfig.model_fields.values())]:
+        for name, field in getattr(model, "model_fields", {}).items():
+            inner = hasattr(field.annotation, "model_fields")
+            assert inner or len(field.description or "") > 10, name
+
+
+# ---- cell ids -------------------------------------------------------------------------------------------------------
+
+
+def test_cell_ids_survive_what_decides_no_result(tmp_path: Path) -> None:
+    before = ids(tmp_path / "a")
+    full = configs.load(SPACE).model_dump(mode="json")
+    full["tracking"]["uri"], full["resources"]["workers"], full["checkpoint"]["every_rounds"] = None, 3, 7
+    rng = random.Random(3)
+    keys = sorted(full, key=lambda _: rng.random())
+    everything = tmp_path / "everything.yaml"  # other order, every default written out, elsewhere
+    everything.write_text(configs.to_yaml({key: full[key] for key in keys} | {"name": "other"}))
+    moved = tmp_path / "moved.csv"
+    lines = Path(full["instances"]["train"]).read_text().splitlines()
+    moved.write_text("\n".join([lines[0], *sorted(lines[1:], key=lambda _: rng.random())]) + "\n")
+    settings = {**SMALL, "checkpoint.every_rounds": 9, "instances.train": str(moved), "learner.gamma": 0.95}
+    after = ids(
+        tmp_path / "b", name="elsewhere", extends=str(everything), set=settings, seeds=[7],
+        resources={"workers": 2, "memory_mb": 500}, retry={"crash": 3}, tracking={"uri": "http://localhost:1"},
+    )  # fmt: skip
+    assert after == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"learner.gamma": 0.9}, {"curriculum.eta": 0.2}, {"env.context_visible": False}, {"rollout.slots": 1},
+        {"evaluation.every_steps": 1000}, {"env.kwargs": {}}, {"budget.steps": 4096},
+    ],
+)  # fmt: skip
+def test_cell_ids_change_with_what_decides_results(change: dict[str, Any], tmp_path: Path) -> None:
+    settings = {**SMALL, "curriculum.allow_context_blind": True}
+    before, after = ids(tmp_path / "a", set=settings), ids(tmp_path / "b", set={**settings, **change})
+    assert (before == after) == (change == {"env.kwargs": {}})  # which is the default
+
+
+def test_cell_ids_change_with_an_edited_instance_file(tmp_path: Path) -> None:
+    copy = tmp_path / "train.csv"
+    text = (ROOT / "configs/instances/pointmass_uniform_train.csv").read_text()
+    copy.write_text(text)
+    settings = {**SMALL, "instances.train": str(copy)}
+    before = ids(tmp_path / "a", set=settings)
+    assert before == ids(tmp_path / "b")
+    lines = text.splitlines()
+    cells = lines[1].split(",")
+    cells[1] = str(float(cells[1]) + 1e-9)
+    copy.write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
+    assert ids(tmp_path / "c", set=settings) != before
+
+
+def test_cell_ids_change_with_an_edited_user_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "my_line"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "env.py").write_text("from tests.tiny_env import make\n")
+    (package / "physics.py").write_text("GRAVITY = 9.81\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    settings = {**TINY, "env": {"id": "my_line.env:make"}, **write_line_instances(tmp_path)}
+    before = ids(tmp_path / "a", set=settings)
+    assert ids(tmp_path / "b", set=settings) == before
+    (package / "physics.py").write_text("GRAVITY = 9.80\n")
+    assert ids(tmp_path / "c", set=settings) != before
+
+
+def test_a_single_module_and_a_missing_one_have_their_digests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lone_env.py").write_text("a = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = source_digest("lone_env:make")
+    (tmp_path / "lone_env.py").write_text("a = 2\n")
+    assert source_digest("lone_env:make") != before
+    with pytest.raises(ConfigError, match="no module 'nowhere_env'"):
+        source_digest("nowhere_env:make")
+
+
+# ---- the manifest ---------------------------------------------------------------------------------------------------
+
+
+def test_a_manifest_is_complete_and_always_the_same_bytes(tmp_path: Path) -> None:
+    path = write_grid(tmp_path)
+    made = plan(path, tmp_path / "runs")
+    content = made.grid.manifest_file.read_bytes()
+    assert plan(path, tmp_path / "runs").new_runs == 0
+    assert made.grid.manifest_file.read_bytes() == content
+    assert plan(path, tmp_path / "other").grid.manifest_file.read_bytes() == content
+    assert Manifest.from_json(content, "it") == made.manifest
+    moved = tmp_path / "moved"
+    made.grid.folder.rename(moved)
+    config = Grid(moved).run_config(made.manifest, made.manifest.runs()[3])
+    assert config.instances.train.parent == moved / "instances"
+    assert (config.seed, config.curriculum.kind) == (1, "space")
+
+
+def test_a_grid_can_grow_and_keeps_what_it_has(tmp_path: Path) -> None:
+    first = plan(write_grid(tmp_path), tmp_path / "runs")
+    second = plan(write_grid(tmp_path, seeds=[0, 1, 2], grid={"curriculum.kappa": [4, 16]}), tmp_path / "runs")
+    assert (second.new_runs, second.dropped_runs) == (4, 2)
+    assert first.manifest.cells[1] == second.manifest.cells[0]
+    lock = Lock(second.grid.lock_file)
+    lock.acquire()
+    try:
+        with pytest.raises(ConfigError, match="somebody is working on it now"):
+            plan(write_grid(tmp_path, seeds=[9]), tmp_path / "runs")
+        assert plan(write_grid(tmp_path, seeds=[0, 1, 2], grid={"curriculum.kappa": [4, 16]}), tmp_path / "runs")
+    finally:
+        lock.release()
+
+
+def test_a_changed_manifest_is_refused(tmp_path: Path) -> None:
+    grid = plan(write_grid(tmp_path), tmp_path / "runs").grid
+    content = grid.manifest_file.read_bytes()
+    rng = random.Random(0)
+    for position in rng.sample(range(len(content)), 60):
+        for changed in (content[:position], content[:position] + b"#" + content[position + 1 :]):
+            if changed.strip() == content.strip():
+                continue
+            grid.manifest_file.write_bytes(changed)
+            with pytest.raises(LedgerError, match=r"damaged|format"):
+                grid.manifest()
+    data = json.loads(content)
+    for forged in ([], 3, {}, {**data, "format": 99}, {**data, "cells": [{"id": "../x"}]}):
+        grid.manifest_file.write_text(json.dumps(forged))
+        with pytest.raises(LedgerError, match=r"damaged|format"):
+            grid.manifest()
+    grid.manifest_file.write_bytes(content)
+    changed_file = next(grid.instances.glob("*.csv"))
+    changed_file.write_text(changed_file.read_text() + "\n")
+    with pytest.raises(LedgerError, match="changed since the grid was frozen"):
+        grid.instance_files(grid.manifest())
+
+
+def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
+    path = write_grid(tmp_path)
+    with pytest.raises(LedgerError, match="grid plan"):
+        find_grid(path, tmp_path / "runs")
+    grid, manifest = (made := plan(path, tmp_path / "runs")).grid, made.manifest
+    for name in (path, grid.folder, grid.manifest_file):
+        assert find_grid(name, tmp_path / "runs").folder == grid.folder
+    cell = manifest.cells[1]
+    assert manifest.cell("kappa=4") == manifest.cell(cell.id) == manifest.cell(cell.id[:6]) == cell
+    with pytest.raises(ConfigError, match="did you mean 'kappa=4'"):
+        manifest.cell("kapa=4")
+    with pytest.raises(ConfigError, match="no seed 7; it has 0, 1"):
+        manifest.run("kappa=4", 7)
+    with pytest.raises(LedgerError, match="no grid"):
+        find_grid(tmp_path, tmp_path / "runs")
+
+
+def test_ten_thousand_runs_are_planned_and_shown(tmp_path: Path) -> None:
+    kappas, etas = list(range(1, 26)), [round(0.01 * step, 2) for step in range(1, 41)]
+    path = write_grid(
+        tmp_path, grid={"curriculum.kappa": kappas, "curriculum.eta": etas}, seeds={"count": 10}
+    )  # fmt: skip
+    made = plan(path, tmp_path / "runs")
+    found = standings(made.grid, made.manifest, CODE)
+    assert (len(made.manifest.cells), len(found), exit_code(found)) == (1000, 10_000, 3)
+    assert len({cell.id for cell in made.manifest.cells}) == len({cell.label for cell in made.manifest.cells}) == 1000
+
+
+# ---- where runs stand -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> tuple[Grid, Manifest, Run]:
+    made = plan(write_grid(tmp_path, retry={"crash": 1, "killed": 0}), tmp_path / "runs")
+    return made.grid, made.manifest, made.manifest.runs()[0]
+
+
+def standing(one: tuple[Grid, Manifest, Run]) -> tuple[str, Cause | None]:
+    grid, manifest, run = one
+    found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
+    return found.condition, found.cause
+
+
+def test_conditions_follow_the_history_of_attempts(one: tuple[Grid, Manifest, Run]) -> None:
+    grid, _, run = one
+    attempts = Attempts(grid.ledger(run))
+    assert standing(one) == ("waiting", None)
+    attempts.begin(1, {})
+    assert standing(one) == ("running", None)  # this process has begun it, and lives
+    attempts.end(1, Ended(Cause.CRASH, "oh"))
+    assert standing(one) == ("waiting", Cause.CRASH)
+    attempts.begin(2, {})
+    attempts.end(2, Ended(Cause.PREEMPTED))
+    assert standing(one) == ("waiting", Cause.PREEMPTED)
+    attempts.begin(3, {})
+    attempts.end(3, Ended(Cause.CRASH, "oh again"))
+    assert standing(one) == ("failed", Cause.CRASH)
+    attempts.forgive()
+    assert standing(one) == ("waiting", None)
+    attempts.end(4, Ended(Cause.KILLED))
+    assert standing(one) == ("failed", Cause.KILLED)
+    attempts.forgive()
+    attempts.end(5, Ended(Cause.CONFIG_ERROR, "bad"))
+    assert standing(one) == ("failed", Cause.CONFIG_ERROR)
+    attempts.end(6, Ended(Cause.STOPPED))
+    assert standing(one) == ("waiting", Cause.STOPPED)
+
+
+def test_a_supervisor_that_is_gone_leaves_a_killed_run(one: tuple[Grid, Manifest, Run]) -> None:
+    grid, _, run = one
+    code = f"""
+from pathlib import Path
+from space_dist.ledger import Ledger
+from space_dist.standing import Attempts
+Attempts(Ledger({str(grid.ledger(run).folder)!r})).begin(1, {{}})
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert standing(one) == ("waiting", Cause.KILLED)
+
+
+def test_torn_and_foreign_rows_are_passed_over(one: tuple[Grid, Manifest, Run]) -> None:
+    grid, _, run = one
+    attempts = Attempts(grid.ledger(run))
+    attempts.begin(1, {})
+    attempts.end(1, Ended(Cause.CRASH, "oh"))
+    content = attempts.path.read_bytes()
+    for length in range(len(content) + 1):
+        attempts.path.write_bytes(content[:length])
+        attempts.history()
+        attempts.end(2, Ended(Cause.TIMEOUT, "x"))
+        last = attempts.history().last
+        assert last is not None
+        assert last.cause is Cause.TIMEOUT
+    attempts.path.write_bytes(b'{"event":"end"}\n\xff\xfe\n[]\n' + content)
+    assert attempts.history().begun == 1
+
+
+def test_a_damaged_status_is_a_failure_that_says_so(one: tuple[Grid, Manifest, Run]) -> None:
+    grid, manifest, run = one
+    ledger = grid.ledger(run)
+    ledger.folder.mkdir(parents=True)
+    ledger.status_file.write_text("{}")
+    found = standing_of(run, ledger, manifest.retry, CODE)
+    assert (found.condition, "damaged" in found.detail) == ("failed", True)
+
+
+def test_last_lines_of_anything(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    assert last_lines(path) == []
+    path.write_bytes(b"a\n\n" * 100_000 + b"\xff\nlast\n")
+    assert last_lines(path, 2) == ["\ufffd", "last"]
+
+
+# ---- attempts under a supervisor ------------------------------------------------------------------------------------
+
+
+class Supervised:
+    """`python -m space_dist.supervisor`, spoken to as a pool does."""
+
+    def __init__(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "space_dist.supervisor"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        assert "ready" in self.read()
+
+    def read(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
+        return answer
+
+    def send(self, message: dict[str, Any]) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(message).encode() + b"\n")
+        self.process.stdin.flush()
+
+    def attempt(self, grid: Grid, run: Run, attempt: int = 1) -> dict[str, Any]:
+        self.send({"grid": str(grid.folder), "cell": run.cell.id, "seed": run.seed, "attempt": attempt})
+        return self.read()
+
+
+@pytest.fixture(scope="module")
+def supervised() -> Any:
+    made = Supervised()
+    yield made
+    assert made.process.stdin is not None
+    made.process.stdin.close()
+    assert made.process.wait(timeout=30) == 0
+
+
+def faulty(folder: Path, fault: str, marker: str = "", **sections: Any) -> tuple[Grid, Manifest, Run]:
+    kwargs = {"fault": fault, "marker": marker}
+    settings = {**TINY, "env": {"id": "tests.fault_env:make", "kwargs": kwargs}, **write_line_instances(folder)}
+    made = plan(write_grid(folder, grid={}, set=settings, seeds=[0], **sections), folder / "runs")
+    return made.grid, made.manifest, made.manifest.runs()[0]
+
+
+@pytest.fixture(scope="module")
+def unharmed(supervised: Supervised, tmp_path_factory: pytest.TempPathFactory) -> list[Row]:
+    grid, _, run = faulty(tmp_path_factory.mktemp("calm"), "none")
+    assert supervised.attempt(grid, run)["cause"] is None
+    return grid.ledger(run).rows(METRICS)
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause", "words", "sections"),
+    [
+        ("raise", Cause.CRASH, "the ground gave way", {}),
+        ("segfault", Cause.CRASH, "SIGSEGV", {}),
+        ("kill", Cause.KILLED, "SIGKILL", {}),
+        ("terminate", Cause.PREEMPTED, "SIGTERM", {}),
+        ("config", Cause.CONFIG_ERROR, "the ground is not known", {}),
+        ("memory", Cause.OUT_OF_MEMORY, "memory_mb is 900", {"resources": {"memory_mb": 900}}),
+        ("no_memory", Cause.OUT_OF_MEMORY, "MemoryError", {}),
+        ("slow", Cause.TIMEOUT, "0.1 minutes", {"resources": {"minutes": 0.1, "grace_seconds": 1.0}}),
+        ("stop", Cause.KILLED, "SIGSTOP", {}),
+    ],
+)  # fmt: skip
+def test_causes_are_told_apart_and_retries_finish_the_run(
+    supervised: Supervised, unharmed: list[Row], fault: str, cause: Cause, words: str, sections: dict[str, Any],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    grid, manifest, run = faulty(tmp_path, fault, str(tmp_path / "marker"), **sections)
+    first = supervised.attempt(grid, run)
+    assert (first["cause"], first["busy"]) == (cause, False)
+    assert words in first["detail"]
+    found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
+    retried = cause in (Cause.KILLED, Cause.PREEMPTED)
+    assert (found.condition, found.cause) == ("waiting" if retried else "failed", cause)
+    again = supervised.attempt(grid, run, 2)
+    assert again["cause"] is None, again
+    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
+    assert grid.ledger(run).rows(METRICS) == unharmed
+
+
+def test_a_run_that_others_work_on_is_left_alone(supervised: Supervised, tmp_path: Path) -> None:
+    grid, _, run = faulty(tmp_path, "none")
+    grid.ledger(run).folder.mkdir(parents=True)
+    lock = Lock(grid.ledger(run).lock_file)
+    lock.acquire()
+    try:
+        assert supervised.attempt(grid, run)["busy"]
+    finally:
+        lock.release()
+    assert Attempts(grid.ledger(run)).history().begun == 0
+
+
+def test_a_stop_makes_a_checkpoint_and_the_run_goes_on(supervised: Supervised, tmp_path: Path) -> None:
+    grid, manifest, run = faulty(tmp_path, "none")
+    supervised.send({"grid": str(grid.folder), "cell": run.cell.id, "seed": 0, "attempt": 1})
+    supervised.send({"stop": "stopped"})
+    ended = supervised.read()
+    assert ended["cause"] in ("stopped", None)  # None: it was done before it heard
+    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition in ("waiting", "done")
+    assert supervised.attempt(grid, run, 2)["cause"] is None
+
+
+def test_a_run_stops_when_its_supervisor_is_killed(tmp_path: Path) -> None:
+    grid, manifest, run = faulty(tmp_path, "slow")
+    lonely = Supervised()
+    lonely.send({"grid": str(grid.folder), "cell": run.cell.id, "seed": 0, "attempt": 1})
+    deadline = time.monotonic() + 30
+    while not grid.ledger(run).owner_alive() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert grid.ledger(run).owner_alive()
+    lonely.process.kill()
+    lonely.process.wait()
+    while grid.ledger(run).owner_alive() and time.monotonic() < deadline + 40:
+        time.sleep(0.1)
+    found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
+    assert (found.condition, found.cause) == ("waiting", Cause.KILLED)
+
+
+# ---- the conductor --------------------------------------------------------------------------------------------------
+
+
+class Script:
+    """An executor that ends runs as it is told to: a list of causes for each run."""
+
+    def __init__(self, grid: Grid, causes: dict[str, list[Cause | None]], size: int = 2) -> None:
+        self.grid, self.causes, self.size = grid, causes, size
+        self.live: list[tuple[Run, int]] = []
+        self.started: list[str] = []
+        self.most = 0
+
+    def room(self) -> int:
+        return self.size - len(self.live)
+
+    def start(self, run: Run, attempt: int) -> None:
+        self.started.append(run.key)
+        self.live.append((run, attempt))
+        self.most = max(self.most, len(self.live))
+        Attempts(self.grid.ledger(run)).begin(attempt, {})
+
+    def poll(self) -> list[tuple[Run, Ended | None]]:
+        ended: list[tuple[Run, Ended | None]] = []
+        for run, attempt in self.live:
+            causes = self.causes.get(run.key, [])
+            how = Ended(causes.pop(0) if causes else None, "as told")
+            Attempts(self.grid.ledger(run)).end(attempt, how)
+            ended.append((run, how))
+        self.live = []
+        return ended
+
+    def stop(self) -> None:
+        pass
+
+    def adopt(self, runs: Any) -> list[Run]:  # noqa: ARG002
+        return []
+
+
+def test_the_conductor_retries_by_cause_and_never_starts_more_than_fits(tmp_path: Path) -> None:
+    made = plan(write_grid(tmp_path, retry={"killed": 1, "crash": 0}), tmp_path / "runs")
+    grid, manifest, runs = made.grid, made.manifest, made.manifest.runs()
+    causes: dict[str, list[Cause | None]] = {
+        runs[0].key: [Cause.KILLED], runs[1].key: [Cause.CRASH], runs[2].key: [Cause.KILLED] * 2,
+        runs[3].key: [Cause.CONFIG_ERROR],
+    }  # fmt: skip
+    script = Script(grid, causes)
+    Conductor(grid, manifest, runs, script, stop_requested=lambda: None).conduct()
+    assert [script.started.count(run.key) for run in runs] == [2, 1, 2, 1]
+    assert script.most == 2
+    found = [standing_of(run, grid.ledger(run), manifest.retry, CODE).cause for run in runs[1:]]
+    assert found == [Cause.CRASH, Cause.KILLED, Cause.CONFIG_ERROR]
+    again = Script(grid, {})
+    Conductor(grid, manifest, runs[1:], again, stop_requested=lambda: None).conduct()
+    assert again.started == []
+
+
+def test_settings_of_a_run_in_a_grid_cannot_be_its_own_pusher(one: tuple[Grid, Manifest, Run]) -> None:
+    grid, manifest, run = one
+    shared = dataclasses.replace(
+        manifest, tracking=manifest.tracking.model_copy(update={"uri": "http://127.0.0.1:1"})
+    )  # fmt: skip
+    config = grid.run_config(shared, run)
+    assert (config.tracking.uri, config.tracking.live, config.tracking.experiment) == (
+        "http://127.0.0.1:1", False, "small",
+    )  # fmt: skip

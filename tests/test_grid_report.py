@@ -1,0 +1,553 @@
+"""Reports on grids: statistics against enumeration and hand, and nothing hidden, dropped or believed."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import itertools
+import math
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from space_dist.cli import main
+from space_dist.errors import ConfigError
+from space_dist.ledger import Ledger, RunWriter
+from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
+from space_dist.report import build_grid_report
+from space_dist.report.document import Document, Section, escaped, to_html, to_markdown
+from space_dist.report.grid import compare, heat_maps, pool, read_cells
+from space_dist.report.statistics import (
+    Interval,
+    bootstrap_interval,
+    estimates,
+    interquartile_mean,
+    intervals,
+    mean,
+    median,
+    paired_ratio,
+    probability_of_improvement,
+    restricted,
+    start_bound,
+    steps_to_threshold,
+    stratified,
+)
+from space_dist.standing import Attempts, Cause, Ended
+from tests.test_report import GROWTH, continue_run, start_run
+
+START = (-10.0, -8.0, -6.0, -4.0)  # returns at steps 0 to 3,000; the fifth, at 4,000, is the final one
+
+
+def make_grid(
+    folder: Path, points: Sequence[Mapping[str, Any]], *, n_seeds: int = 3, baseline: int = 0,
+    labels: Sequence[str] | None = None, code: str = "unknown",
+) -> Grid:  # fmt: skip
+    """A frozen grid of 4,000 steps a run, none of which has begun."""
+    cells = []
+    for number, point in enumerate(points):
+        env = {"id": point.get("env.id", "space_dist/PointMass-v0")}
+        config = {"env": env, "instances": {"train": "a.csv", "test": "b.csv"}, "budget": {"steps": 4000}}
+        label = " ".join(f"{key}={value}" for key, value in point.items()) if labels is None else labels[number]
+        cells.append(Cell(hashlib.sha256(str(number).encode()).hexdigest()[:12], label, point, config))
+    axes = tuple(dict.fromkeys(key for point in points for key in point))
+    manifest = Manifest(
+        "grid", axes, tuple(cells), tuple(range(n_seeds)), RunResources(), Retry(), GridTracking(uri=None),
+        cells[baseline].id, {}, code, {},
+    )  # fmt: skip
+    grid = Grid(folder)
+    grid.freeze(manifest, {})
+    return grid
+
+
+def finish(grid: Grid, cell: int, seed: int, *returns: float | None, state: str = "done") -> Ledger:
+    """A run with these test returns at steps 0, 1000, ...; given one, it is the final return."""
+    ledger = grid.ledger(grid.manifest().run(grid.manifest().cells[cell].id, seed))
+    start_run(ledger.folder, seed=seed)
+    curve = returns if len(returns) > 1 else (*START, *returns)
+    growth = [*GROWTH, *[GROWTH[-1]] * len(curve)][: len(curve) - 1]
+    continue_run(ledger, curve, growth, state=state, success=0.5)
+    return ledger
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ---- statistics -----------------------------------------------------------------------------------------------------
+
+
+def bounds(outcomes: Sequence[float]) -> tuple[float, float]:
+    """The 95 % percentile bounds of all equally likely resamples."""
+    low, high = np.percentile(outcomes, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def picks(values: Sequence[float]) -> list[tuple[float, ...]]:
+    return list(itertools.product(values, repeat=len(values)))
+
+
+def test_strata_are_resampled_each_for_itself() -> None:
+    """Strata 0, 1 and 10, 14: every resample has two of each, so the mean lies in [5, 7.5]; unstratified in [0, 14]."""
+    strata = [np.array([0.0, 1.0]), np.array([10.0, 14.0])]
+    assert stratified(strata, mean) == Interval(6.25, 5.0, 7.5)
+    assert stratified([strata[0], np.array([3.0])]) == Interval(4.0 / 3.0)
+
+
+def test_the_stratified_interval_is_that_of_all_resamples() -> None:
+    """The IQM of six pooled values: without the least and the greatest, over 27 x 27 resamples."""
+    one, two = (1.0, 2.0, 6.0), (3.0, 4.5, 9.0)
+    outcomes = [float(np.mean(sorted(a + b)[1:-1])) for a in picks(one) for b in picks(two)]
+    found = stratified([np.array(one), np.array(two)])
+    assert found.value == np.mean([2.0, 3.0, 4.5, 6.0])
+    np.testing.assert_allclose((found.low, found.high), bounds(outcomes), atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("statistic", "by_hand"),
+    [(mean, np.mean), (median, np.median), (interquartile_mean, lambda values: np.mean(sorted(values)[1:-1]))],
+)
+def test_intervals_are_those_of_all_resamples(
+    statistic: Callable[..., Any], by_hand: Callable[[Sequence[float]], float]
+) -> None:
+    values = (0.0, 1.0, 5.0, 7.0, 20.0)
+    (found,) = intervals([np.array(values)], statistic)
+    assert found.value == by_hand(values)
+    np.testing.assert_allclose((found.low, found.high), bounds([float(by_hand(p)) for p in picks(values)]), atol=0.6)
+
+
+def test_many_samples_at_once_are_like_each_alone() -> None:
+    random = np.random.default_rng(3)
+    samples = [random.normal(size=n) for n in (4, 1, 7, 4, 0, 4)]
+    for found, sample in zip(estimates(samples), samples, strict=True):
+        assert found.n == len(sample)
+        if len(sample) > 1:
+            low, high = bootstrap_interval(sample)
+            assert found.iqm == Interval(float(interquartile_mean(sample)), float(low), float(high))
+            assert found.mean == intervals([sample], mean)[0]
+
+
+def test_degenerate_samples_have_an_answer_and_no_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert intervals([np.full(5, 2.0)], median) == [Interval(2.0, 2.0, 2.0)]
+        assert intervals([np.array([2.0])], median) == [Interval(2.0)]
+        diverged, empty = intervals([np.array([1.0, np.nan, 3.0]), np.array([])], interquartile_mean)
+        assert math.isnan(diverged.value)
+        assert math.isnan(empty.value)
+        assert (diverged.low, empty.low) == (None, None)
+        same = np.full(3, 2.0)
+        assert probability_of_improvement(same, same) == Interval(0.5, 0.5, 0.5)
+        assert probability_of_improvement(same, np.array([1.0])) == Interval(1.0)
+        assert math.isnan(probability_of_improvement(same, np.array([])).value)
+        assert math.isnan(probability_of_improvement(same, np.array([np.nan, 1.0])).value)
+        assert math.isnan(paired_ratio(same, np.zeros(3)).value)
+        assert paired_ratio(np.array([1.0, 2.0]), np.array([0.0, 6.0])) == Interval(0.5)
+        assert paired_ratio(np.array([1.0]), np.array([2.0])) == Interval(0.5)
+        assert math.isnan(stratified([np.array([1.0, np.nan]), same]).value)
+
+
+def test_probability_of_improvement_counts_all_pairs_and_half_the_ties() -> None:
+    """1 beats 0; 2 beats 0 and ties twice; 3 beats all: 1 + 2 + 3 of 9. SciPy's U statistic counts the same."""
+    ours, theirs = (1.0, 2.0, 3.0), (2.0, 2.0, 0.0)
+    found = probability_of_improvement(np.array(ours), np.array(theirs))
+    assert found.value == pytest.approx(6 / 9)
+    assert found.value == pytest.approx(stats.mannwhitneyu(ours, theirs).statistic / 9)
+    outcomes = [
+        np.mean([1.0 if x > y else 0.5 if x == y else 0.0 for x in a for y in b])
+        for a in picks(ours) for b in picks(theirs)
+    ]  # fmt: skip
+    assert (found.low, found.high) == pytest.approx(bounds(outcomes))
+
+
+def test_probability_of_improvement_of_unequal_samples() -> None:
+    random = np.random.default_rng(0)
+    ours, theirs = random.normal(0.3, 1.0, 40), random.normal(0.0, 1.0, 25)
+    found = probability_of_improvement(ours, theirs)
+    assert found.value == pytest.approx(stats.mannwhitneyu(ours, theirs).statistic / 1000)
+    draws = [(random.choice(ours, 40)[:, None] > random.choice(theirs, 25)[None]).mean() for _ in range(4000)]
+    np.testing.assert_allclose((found.low, found.high), bounds(draws), atol=0.02)  # four standard errors of 2,000
+
+
+@pytest.mark.parametrize(
+    ("returns", "answer"),
+    [
+        ([0, 5, 5, 5, 0], 1000.0),  # what comes later does not count
+        ([0, 5, 5, 0, 5, 5, 5], 4000.0),  # two are not enough
+        ([5, 5, 5], 0.0),
+        ([0, 0, 5, 5], math.nan),  # the budget ends before the third
+        ([0, 5, math.nan, 5, 5], math.nan),
+        ([5, 5], math.nan),
+        ([], math.nan),
+    ],
+)
+def test_a_threshold_is_reached_by_three_evaluations_in_a_row(returns: list[float], answer: float) -> None:
+    steps = np.arange(len(returns)) * 1000
+    np.testing.assert_equal(steps_to_threshold(steps, np.array(returns, dtype=float), 5.0), answer)
+
+
+def test_censored_times_count_as_the_budget_and_seeds_go_in_pairs() -> None:
+    np.testing.assert_equal(restricted(np.array([1.0, np.nan, 9.0]), 4.0), [1.0, 4.0, 4.0])
+    assert paired_ratio(np.array([2.0, 4.0]), np.array([4.0, 4.0])) == Interval(0.75, 0.5, 1.0)
+    # Every seed needs half of its twin's steps, so every resample does; in other pairs it would be 1/6 to 3/2.
+    assert paired_ratio(np.array([1.0, 3.0]), np.array([2.0, 6.0])) == Interval(0.5, 0.5, 0.5)
+
+
+def test_the_noise_of_step_0_is_a_prediction_bound() -> None:
+    """1 and 3: mean 2, standard deviation sqrt(2), and Student's t of 12.706 for one degree of freedom."""
+    assert start_bound(np.array([1.0, 3.0])) == pytest.approx(2.0 + 12.7062 * math.sqrt(2.0) * math.sqrt(1.5), rel=1e-5)
+    assert start_bound(np.full(9, 4.0)) == 4.0
+    assert start_bound(np.array([4.0])) == math.inf
+
+
+# ---- a grid of a baseline and two by two cells, one run failed and one not begun -------------------------------------
+
+POINTS = (
+    {"curriculum": {"kind": "round_robin"}},
+    *({"curriculum": {"kind": "space", "eta": eta, "kappa": kappa}} for eta in (0.1, 0.2) for kappa in (1, 4)),
+)
+FINALS = ((1.0, 2.0, 6.0), (2.0, 3.0, 7.0), (9.0, 9.0), (0.0, 1.0, 2.0), (4.0, 5.0))
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Grid:
+    grid = make_grid(tmp_path_factory.mktemp("grid") / "grid", POINTS, labels=["robin", "a", "b", "c", "d"])
+    for cell, finals in enumerate(FINALS):
+        for seed, final in enumerate(finals):
+            finish(grid, cell, seed, final)
+    failed = finish(grid, 2, 2, -10.0, -8.0, state="failed")
+    Attempts(failed).begin(1, {})
+    Attempts(failed).end(1, Ended(Cause.OUT_OF_MEMORY, "4,100 MB of 4,000 MB\n<b>last words</b>"))
+    other = grid.ledger(grid.manifest().run("a", 1))
+    with RunWriter(other) as writer:
+        writer.status = other.status()
+        writer.set_status(
+            dataclasses.replace(writer.status, fingerprint={"cpu": "another", "torch": "2.0", "code": "new"})
+        )
+    return grid
+
+
+@pytest.fixture(scope="module")
+def written(grid: Grid) -> Path:
+    return build_grid_report(grid).folder
+
+
+def test_every_number_says_how_many_seeds_it_rests_on(grid: Grid, written: Path) -> None:
+    assert written == grid.folder / "report"
+    text = (written / "report.md").read_text()
+    assert "13 of 15 runs are finished (5 cells × 3 seeds); 1 failed, 1 waiting." in text
+    assert "| robin (baseline) | 3/3 | — | 3.000 [1.000, 6.000] (3/3) | 3.000 [1.000, 6.000] (3/3) |" in text
+    assert "| b | 2/3 | 1 failed: out of memory | 9.000 [9.000, 9.000] (2/3) |" in text
+    assert "| d | 2/3 | 1 waiting | 4.500 [4.000, 5.000] (2/3) |" in text
+    assert "1.00 [1.00, 1.00] (2/3 against 3/3)" in text
+    checked = 0
+    for head, body in re.findall(r"(?m)^(\| cell .*)\n\| ---.*\n((?:\|.*\n)+)", text):
+        columns = head.split(" | ")
+        for line in body.splitlines():
+            for column, cell in zip(columns, line.split(" | "), strict=True):
+                if column.strip("| ") not in ("cell", "threshold", "not finished") and re.search(r"\d", cell):
+                    assert re.search(r"\d/\d", cell), line
+                    checked += 1
+    assert checked > 50
+
+
+def test_the_same_runs_give_the_same_report(grid: Grid, written: Path, tmp_path: Path) -> None:
+    again = build_grid_report(grid, tmp_path).folder
+    for name in ("report.md", "report.html", "cells.csv", "runs.csv"):  # the page holds the figures
+        assert (again / name).read_bytes() == (written / name).read_bytes()
+
+
+def test_cells_csv_has_the_numbers_in_full(written: Path) -> None:
+    found = {row["configuration"]: row for row in rows(written / "cells.csv")}
+    assert [*found] == ["robin", "a", "b", "c", "d"]
+    a = found["a"]
+    assert [float(a[f"test_return_{name}"]) for name in ("iqm", "iqm_low", "iqm_high", "mean", "median")] == [
+        4,
+        2,
+        7,
+        4,
+        3,
+    ]
+    # 2 beats 1 and ties 2; 3 beats 1 and 2; 7 beats all
+    assert float(a["probability_of_improvement"]) == pytest.approx(6.5 / 9)
+    assert (a["runs"], a["finished"], a["baseline_return_seeds"]) == ("3", "3", "3")
+    assert found["robin"]["probability_of_improvement"] == ""
+    assert (found["b"]["finished"], found["b"]["not_finished"]) == ("2", "1 failed: out of memory")
+
+
+def test_failed_runs_are_shown_with_their_cause(written: Path) -> None:
+    text = (written / "report.md").read_text()
+    assert "1 run failed and is in no number: 1 out of memory." in text
+    assert "| b, seed 2 | out of memory | 4,100 MB of 4,000 MB | 1,000 of 4,000 | 1 |" in text
+    assert "<pre>4,100 MB of 4,000 MB\n&lt;b&gt;last words&lt;/b&gt;</pre>" in (written / "report.html").read_text()
+    listed = rows(written / "runs.csv")
+    assert len(listed) == 15
+    unfinished = [row for row in listed if row["condition"] != "done"]
+    assert [(row["label"], row["seed"], row["condition"], row["cause"]) for row in unfinished] == [
+        ("b", "2", "failed", "out_of_memory"), ("d", "2", "waiting", ""),
+    ]  # fmt: skip
+
+
+def test_runs_of_other_code_and_machines_are_named(written: Path) -> None:
+    text = (written / "report.md").read_text()
+    assert (
+        "Finished by another code, and counted all the same: 1 run, a seed 1 (code new; the grid was frozen by unknown)"
+        in text
+    )
+    assert (
+        "Finished by another cpu, and counted all the same: 1 run, a seed 1 (cpu another; most runs have test)." in text
+    )
+
+
+def test_the_heat_map_is_that_of_the_two_parameters(grid: Grid, written: Path) -> None:
+    (found,) = heat_maps(read_cells(grid, grid.manifest()))
+    assert (found.title, found.column_name, found.row_name) == ("kind=space", "eta", "kappa")
+    assert (found.columns, found.rows) == (["0.1", "0.2"], ["1", "4"])
+    np.testing.assert_allclose(found.means, [[4.0, 1.0], [9.0, 4.5]])
+    np.testing.assert_allclose(found.spreads, [[math.sqrt(7.0), 1.0], [0.0, math.sqrt(0.5)]])
+    assert found.seeds == [["3/3", "3/3"], ["2/3", "2/3"]]
+    assert "| 4 | 9.00 ± 0.00 (2/3) | 4.50 ± 0.71 (2/3) |" in (written / "report.md").read_text()
+    assert (written / "heat_map_1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_settings_are_pooled_over_the_others(grid: Grid) -> None:
+    found = {one.setting: one for one in pool(read_cells(grid, grid.manifest()))}
+    assert [*found] == ["kind=round_robin", "kind=space", "eta=0.1", "eta=0.2", "kappa=1", "kappa=4"]
+    kappa = found["kappa=1"]  # 2, 3, 7 and 0, 1, 2
+    assert (kappa.n_cells, kappa.n_finished, kappa.n_runs, kappa.iqm.value) == (2, 6, 6, 2.0)
+    assert (found["kappa=4"].n_finished, found["kappa=4"].n_runs) == (4, 6)
+
+
+class Page(HTMLParser):
+    """What a browser would see: tags, addresses, and text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.addresses: list[str] = []
+        self.attributes: set[str] = set()
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "action", "data", "srcset")]
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_the_page_needs_nothing_else(written: Path) -> None:
+    text = (written / "report.html").read_text()
+    page = Page(text)
+    assert not page.tags & {"script", "link", "iframe", "object", "b"}
+    assert len(page.addresses) == 2
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "default-src 'none'" in text
+    assert 'name="viewport"' in text
+
+
+# ---- thresholds -----------------------------------------------------------------------------------------------------
+
+
+def test_steps_to_the_threshold_with_censoring_and_pairs(tmp_path: Path) -> None:
+    """The baseline's seeds end at 5, 5, 5; they reach it at 1,000, 2,000 and 2,000 steps. Of the cell, seed 0 reaches
+    it at 1,000, seed 1 never, and seed 2 is missing: the ratio is (1,000 + 4,000) / (1,000 + 2,000)."""
+    grid = make_grid(tmp_path / "g", [{"k": 1}, {"k": 2}, {"k": 3}])
+    late = (0.0, 0.0, 5.0, 5.0, 5.0)
+    for seed, curve in enumerate(((0.0, 5.0, 5.0, 5.0, 5.0), late, late)):
+        finish(grid, 0, seed, *curve)
+    finish(grid, 1, 0, 0.0, 6.0, 6.0, 6.0, 6.0)
+    finish(grid, 1, 1, 0.0, 6.0, 6.0, 0.0, 6.0)
+    cells = read_cells(grid, grid.manifest())
+    base, cell, empty = compare(cells, cells[0])
+
+    assert base.threshold == cell.threshold == 5.0
+    assert base.reach is not None
+    assert base.reach.times.tolist() == [1000, 2000, 2000]
+    assert base.reach.mean == Interval(pytest.approx(5000 / 3), 1000.0, 2000.0)
+    assert cell.reach is not None
+    assert (cell.reach.censored, cell.reach.budget) == (1, 4000)
+    assert cell.reach.mean == Interval(2500.0, 1000.0, 4000.0)
+    assert cell.ratio == Interval(pytest.approx(5 / 3), 1.0, 2.0)
+    assert cell.pairs == 2
+    assert (empty.reach, empty.untestable) == (None, "no finished seed")
+
+    text = build_grid_report(grid, tmp_path / "out").markdown
+    assert (
+        "| k=2 | 5.000 | 1/2 | 1/2 at 4,000 steps | 2,500 [1,000, 4,000] (2/3) | "
+        "1.67 [1.00, 2.00] (2/3 pairs) |" in text
+    )
+    assert compare(cells, cells[0], 100.0)[1].ratio is None  # reached by nobody: nothing is known, not a ratio of 1
+
+
+def test_a_threshold_within_the_noise_of_step_0_is_untestable(tmp_path: Path) -> None:
+    """Untrained seeds return 0, 1 and 2, so that one more may well return 1 + 4.303 * sqrt(4/3) = 5.97."""
+    grid = make_grid(tmp_path / "g", [{"k": 1}, {"k": 2}])
+    for cell, final in ((0, 5.9), (1, 6.0)):
+        for seed in range(3):
+            finish(grid, cell, seed, float(seed), final, final, final, final)
+    cells = read_cells(grid, grid.manifest())
+    for found in compare(cells, cells[0]):
+        assert found.reach is None
+        assert found.untestable == "untestable: within noise of step 0 (up to 5.968)"
+    assert all(found.reach is not None for found in compare(cells, cells[1]))
+
+
+# ---- odd grids ------------------------------------------------------------------------------------------------------
+
+
+def test_a_grid_without_a_finished_run_says_so(tmp_path: Path) -> None:
+    grid = make_grid(tmp_path / "g", [{"k": 1}, {"k": 2}])
+    report = build_grid_report(grid)
+    assert (
+        "No run of this grid has finished yet, so there is no number to report: of its 6 runs (2 cells × 3 seeds), "
+        "6 waiting." in report.markdown
+    )
+    assert not (report.folder / "curves.png").exists()
+    assert "Steps to the threshold" not in report.markdown
+    finish(grid, 1, 0, -1.0, 0.0, state="interrupted")
+    report = build_grid_report(grid)
+    assert report.summary[0].startswith("No run of this grid has finished yet")
+    assert report.table[1]["test return, IQM [95 %]"] == "— (0/3)"
+    assert (report.folder / "curves.png").exists()  # an unfinished curve is better than none, and is labelled so
+
+
+def test_a_run_that_cannot_be_read_is_a_failed_one(tmp_path: Path) -> None:
+    grid = make_grid(tmp_path / "g", [{"k": 1}, {"k": 2}], n_seeds=2)
+    for seed in range(2):
+        finish(grid, 0, seed, 1.0)
+    damaged = finish(grid, 1, 0, 1.0)
+    (damaged.folder / "metrics.jsonl").write_text("{}\n")
+    finish(grid, 1, 1, 2.0)
+    report = build_grid_report(grid)
+    assert report.table[1]["seeds"] == "1/2"
+    assert "| k=2, seed 0 | crash |" in report.markdown
+    assert "row 1: damaged" in report.markdown
+
+
+def test_returns_of_different_environments_are_never_mixed(tmp_path: Path) -> None:
+    """The baseline of the second environment is the first one's counterpart; the third has none."""
+    points = [{"env.id": env, "k": k} for env in ("one", "two") for k in (1, 2)] + [{"env.id": "three", "k": 2}]
+    grid = make_grid(tmp_path / "g", points, n_seeds=1)
+    for cell, final in enumerate((1.0, 2.0, 100.0, 90.0, 5.0)):
+        finish(grid, cell, 0, final)
+    cells = read_cells(grid, grid.manifest())
+    found = compare(cells, cells[0])
+    assert [None if one.reference is None else cells.index(one.reference) for one in found] == [0, 0, 2, 2, None]
+    assert [one.improvement and one.improvement.value for one in found] == [None, 1.0, None, 0.0, None]
+    assert [one.threshold for one in found[:4]] == [1.0, 1.0, 100.0, 100.0]
+    assert pool(cells) == []
+    report = build_grid_report(grid)
+    assert any("no counterpart of the baseline: env.id=three k=2" in remark for remark in report.remarks)
+
+
+@pytest.mark.parametrize(
+    ("points", "titles"),
+    [
+        ([{"a": a, "b": b} for a in (1, 2) for b in (1, 2)], [""]),
+        ([{"a": a, "b": b, "c": c} for a in (1, 2) for b in (1, 2) for c in (1, 2)], []),  # three parameters
+        ([{"a": a} for a in (1, 2, 3)], []),
+        ([{"a": a, "b": a} for a in (1, 2, 3)], []),  # they go together
+        ([{"extends": x, "a": a, "b": b} for x in "xy" for a in (1, 2) for b in (1, 2)], ["extends=x", "extends=y"]),
+        ([{"c.kind": x, "a": a, "b": b} for x in ("x", "y") for a in (1, 2) for b in (1, 2)], ["kind=x", "kind=y"]),
+        ([{"n": n, "a": a, "b": b} for n in ([1], [2, 3]) for a in (1, 2) for b in (1, 2)], ["n=[1]", "n=[2, 3]"]),
+        ([{"a": a, "b": b} for a in (1, 2) for b in (1, 2) if a + b < 4], [""]),  # one place is empty
+    ],
+)  # fmt: skip
+def test_what_has_a_heat_map(tmp_path: Path, points: list[dict[str, Any]], titles: list[str]) -> None:
+    grid = make_grid(tmp_path / "g", points)
+    assert [found.title for found in heat_maps(read_cells(grid, grid.manifest()))] == titles
+
+
+def test_labels_are_words_wherever_they_stand(tmp_path: Path) -> None:
+    labels = [
+        "<script>alert(1)</script>", "a | b", r"$\frac{", "_hidden", "=HYPERLINK(1)", "[x](javascript:y)",
+        "\x1b[31mred", "'\"><img src=x onerror=y>", "</title><b>",
+    ]  # fmt: skip
+    grid = make_grid(tmp_path / "g", [{"k": k} for k in range(len(labels))], labels=labels, n_seeds=1)
+    for cell in range(len(labels)):
+        finish(grid, cell, 0, float(cell))
+    report = build_grid_report(grid)
+    page = Page((report.folder / "report.html").read_text())
+    assert not page.tags & {"script", "b"}
+    assert not page.attributes & {"onerror"}
+    assert all(address.startswith("data:") for address in page.addresses)
+    assert {"<script>alert(1)</script> (baseline)", "a | b", "'\"><img src=x onerror=y>"} <= {*page.words}
+    assert "\x1b" not in report.markdown
+    assert "<script" not in re.sub(r"\\<", "", report.markdown)
+    assert r"| a \| b | 1/1 |" in report.markdown
+    assert r"[x\](javascript:y)" in report.markdown
+    assert "'=HYPERLINK(1)" in {row["configuration"] for row in rows(report.folder / "cells.csv")}
+
+
+def test_markdown_and_html_of_text() -> None:
+    text = "a_b *c* `d` <e> f|g [h](i) _j_ https://k & [1.0, 2.0]\nl"
+    assert escaped(text) == (
+        r"a_b \*c\* \`d\` \<e\> f\|g [h\](i) \_j\_ https:\//k \& [1.0, 2.0] l"
+    )  # fmt: skip
+    document = Document("<t>", [Section("s & t", ["p"], [{"x": "<1>", "y": "2"}], ["i"])])
+    assert (
+        to_markdown(document) == "# \\<t\\>\n\n## s \\& t\n\np\n\n| x | y |\n| --- | ---: |\n| \\<1\\> | 2 |\n\n- i\n"
+    )
+    assert "<h1>&lt;t&gt;</h1>" in to_html(document)
+
+
+def test_many_cells_are_drawn_in_panels(tmp_path: Path) -> None:
+    grid = make_grid(tmp_path / "g", [{"a": a, "b": b} for a in (1, 2, 3) for b in (1, 2, 3)], n_seeds=1)
+    for cell in range(9):
+        finish(grid, cell, 0, float(cell))
+    report = build_grid_report(grid)
+    assert "grey: the baseline" in report.markdown
+    assert report.table[3]["steps to the threshold"] == "untestable"
+    assert report.table[3]["test return, IQM [95 %]"] == "3.000 [—] (1/1)"
+
+
+# ---- the command line -----------------------------------------------------------------------------------------------
+
+
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+    monkeypatch.setattr("sys.argv", ["space-dist", "report", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    captured = capsys.readouterr()
+    return int(ended.value.code or 0), " ".join((captured.out + captured.err).split())
+
+
+def test_the_command_knows_a_grid(
+    grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "grid.yaml"
+    file.write_text("name: grid\nextends: base.yaml\nseeds: [0]\n")
+    words = [file, "--root", grid.folder.parent, "--out", tmp_path / "out", "--baseline", "c", "--threshold", 3]
+    code, text = command(monkeypatch, capsys, *words)
+    assert (code, "Baseline: c. Threshold of the test return: 3.000 (as asked for)." in text) == (0, True)
+    assert (tmp_path / "out/report.html").exists()
+    for words, complaint in (
+        ([grid.folder, "--baseline", "e"], "grid has no cell 'e'"),
+        ([grid.manifest_file, "--baseline", "e"], "grid has no cell 'e'"),
+        ([grid.folder, tmp_path], "is a grid: give it alone"),
+        ([tmp_path, "--threshold", 3], "are for grids"),
+        ([grid.folder, "--threshold", "nan"], "must be a finite number"),
+    ):
+        code, text = command(monkeypatch, capsys, *words)
+        assert (code, complaint in text) == (2, True), text
+    code, text = command(monkeypatch, capsys, file, "--root", tmp_path)
+    assert (code, "grid plan" in text) == (1, True)
+
+
+def test_an_unwritable_folder_is_one_sentence(grid: Grid, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be written"):
+        build_grid_report(grid, tmp_path / "file")
