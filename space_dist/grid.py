@@ -29,7 +29,7 @@ from space_dist.launch import about, absolute_uri, read_instances
 from space_dist.ledger import Lock
 from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, Run, label_of, load_grid
 from space_dist.provenance import code_digest, git_state, source_digest
-from space_dist.standing import Attempts, Cause, Ended, Standing, may_retry, standing_of, standings, unheard
+from space_dist.standing import Attempts, Ended, Standing, may_retry, standing_of, standings, unheard
 from space_dist.training import make_env, make_setup, total_steps
 
 log = logging.getLogger("space_dist")

@@ -66,8 +66,9 @@ class Stubs:
 
     def start(self, script: Path, *arguments: str, **extra: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            ["bash", str(script), *arguments], env={**self.environment, "SLURM_SUBMIT_DIR": str(script.parent), **extra},
-            cwd=script.parent, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            ["bash", str(script), *arguments], cwd=script.parent,
+            env={**self.environment, "SLURM_SUBMIT_DIR": str(script.parent), **extra},
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 
     def run(self, script: Path, *arguments: str, **extra: str) -> tuple[int, str]:
@@ -136,8 +137,9 @@ def test_only_what_is_set_is_written(manifest: Manifest) -> None:
         "job-name", "nodes", "ntasks-per-node", "cpus-per-task", "output", "open-mode", "requeue", "signal", "array",
     ]  # fmt: skip
     full = render(Export(manifest, _everything(), "array"))
-    for name in ("partition", "account", "qos", "constraint", "nodelist", "exclude", "reservation", "time", "mem", "gres",
-                 "gpus", "exclusive", "error", "mail-user", "mail-type", "dependency", "comment", "licenses"):  # fmt: skip
+    for name in ("partition", "account", "qos", "constraint", "nodelist", "exclude", "reservation", "time", "mem",
+                 "gres", "gpus", "exclusive", "error", "mail-user", "mail-type", "dependency", "comment",
+                 "licenses"):  # fmt: skip
         assert len(re.findall(rf"^#SBATCH --{name}\b(?!-)", full[TRAIN], re.MULTILINE)) == 1, name
     assert "#SBATCH --partition=late\n" in full[AGGREGATE]
     assert "--nodelist" not in full[AGGREGATE]
@@ -203,8 +205,8 @@ def test_what_does_not_go_together_is_refused(manifest: Manifest) -> None:
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("30", 1800), (90, 5400), ("1:30", 90), ("2:00:00", 7200), ("1-0", 86400), ("1-2:03", 93780), ("1-00:00:01", 86401),
-     ("", None), ("1:2:3:4", None), ("x", None)],
+    [("30", 1800), (90, 5400), ("1:30", 90), ("2:00:00", 7200), ("1-0", 86400), ("1-2:03", 93780),
+     ("1-00:00:01", 86401), ("", None), ("1:2:3:4", None), ("x", None)],
 )  # fmt: skip
 def test_time_limits_are_read_as_slurm_does(text: str | int, expected: int | None) -> None:
     assert seconds(text) == expected

@@ -6,6 +6,7 @@ a number or was made safe before, so that no template can forget it.
 
 from __future__ import annotations
 
+import functools
 import re
 import shlex
 from collections.abc import Iterator, Mapping
@@ -198,14 +199,7 @@ def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
 
     Raises ConfigError with file and line of a template's fault.
     """
-    loader = jinja2.ChoiceLoader([
-        *([jinja2.FileSystemLoader(templates)] if templates is not None else []),
-        jinja2.PackageLoader("space_dist.slurm"),
-    ])  # fmt: skip
-    shell = jinja2.Environment(
-        loader=loader, undefined=jinja2.StrictUndefined, finalize=_quoted, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True, autoescape=False,  # noqa: S701 - `finalize` quotes, for the shell
-    )  # fmt: skip
+    shell = _environment(templates)
     prose = shell.overlay(finalize=None)
     files = {TRAIN: f"{grid.mode}.sbatch.j2", AGGREGATE: "aggregate.sbatch.j2", SUBMIT: "submit.sh.j2",
              README: "README.md.j2"}  # fmt: skip
@@ -223,6 +217,18 @@ def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
         except jinja2.TemplateError as error:
             raise ConfigError(f"template {template}: {error.message}") from None
     return texts
+
+
+@functools.lru_cache(maxsize=4)
+def _environment(templates: Path | None) -> jinja2.Environment:
+    loader = jinja2.ChoiceLoader([
+        *([jinja2.FileSystemLoader(templates)] if templates is not None else []),
+        jinja2.PackageLoader("space_dist.slurm"),
+    ])  # fmt: skip
+    return jinja2.Environment(
+        loader=loader, undefined=jinja2.StrictUndefined, finalize=_quoted, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True, autoescape=False,  # noqa: S701 - `finalize` quotes, for the shell
+    )  # fmt: skip
 
 
 def _values(grid: Export) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
 from tests.tiny_env import Line
 
 GATE = "SPACE_DIST_TEST_GATE"
-PAUSE = 0.004
+PAUSE = 0.006
 
 
 class Gated(Line):

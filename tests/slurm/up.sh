@@ -85,7 +85,8 @@ NodeName=n[1-$NODES] NodeAddr=$NET.[11-$((10 + NODES))] Port=$((PORT + 1)) CPUs=
 PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 CONF
 echo "NodeName=n[1-$NODES] Name=gpu File=/dev/tty[1-2]" >"$D/gres.conf" # any device files do
-munged --key-file="$D/munge.key" --socket="$D/run/munge.socket" --pid-file="$D/run/munged.pid" \
+# --force: the folder above may be closed to others
+munged --force --key-file="$D/munge.key" --socket="$D/run/munge.socket" --pid-file="$D/run/munged.pid" \
   --log-file="$D/log/munged.log" --seed-file="$D/run/munge.seed"
 # shellcheck disable=SC2016
 unshare --mount bash -c 'mount --bind "$0" /etc/hosts && slurmctld' "$D/hosts" # it binds to what its host name means
