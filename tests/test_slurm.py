@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,15 @@ from typing import Any
 import pytest
 
 from space_dist import cli
-from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.grid import plan
-from space_dist.manifest import Grid, Manifest
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.grid import Conductor, adopt, plan, working_on
+from space_dist.manifest import Grid, Manifest, Run
 from space_dist.slurm import Export, Mode, Profile, export, load_profile
 from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN, render
 from space_dist.slurm.node import address_facing
 from space_dist.slurm.profile import seconds
 from space_dist.slurm.queue import queue_of
+from space_dist.standing import Cause, Ended, slurm_job, unheard
 
 ROOT = Path(__file__).resolve().parent.parent
 GRID, SITE = ROOT / "configs/grids/pointmass_small.yaml", ROOT / "configs/slurm/site.yaml"
@@ -431,6 +432,62 @@ def test_bash_and_shellcheck_object_to_no_script(manifest: Manifest, tmp_path: P
     assert found.stdout + found.stderr == ""
     found = subprocess.run(["shellcheck", *(ROOT / "tests/slurm").glob("*.sh")], capture_output=True, text=True)
     assert found.stdout + found.stderr == ""
+
+
+# ---- what a task does -----------------------------------------------------------------------------------------------
+
+
+def test_a_requeued_jobs_runs_were_preempted_and_others_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = {"slurm_job": "17", "restarts": 0}
+    assert unheard(here).cause is Cause.KILLED  # nobody here is of SLURM
+    monkeypatch.setenv("SLURM_JOB_ID", "17")
+    assert slurm_job() == here
+    assert unheard(here).cause is Cause.KILLED  # it was this very job that lost it
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert unheard(here).cause is Cause.PREEMPTED
+    assert unheard({"slurm_job": "18", "restarts": 0}).cause is Cause.KILLED
+    assert unheard({}).cause is Cause.KILLED
+
+
+class Idle:
+    """An executor that must never be asked to start anything."""
+
+    def room(self) -> int:
+        return 1
+
+    def start(self, run: Run, attempt: int) -> None:
+        raise AssertionError((run, attempt))
+
+    def poll(self) -> list[tuple[Run, Ended | None]]:
+        return []
+
+    def stop(self) -> None:
+        pass
+
+    def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - it has none
+        return []
+
+
+def test_a_task_obeys_the_users_stop_and_only_the_whole_grid_ends_it(
+    grid: Grid, manifest: Manifest, tmp_path: Path
+) -> None:
+    place = adopt(grid, tmp_path)
+    place.stop_file.touch()
+    task = Conductor(place, manifest, manifest.runs()[:1], Idle(), stop_requested=lambda: None)
+    with pytest.raises(Interrupted, match="the grid's file `stop`"):
+        task.conduct()
+    assert place.stop_file.exists()
+    quiet = dataclasses.replace(manifest, tracking=manifest.tracking.model_copy(update={"uri": None}))
+    with working_on(place, quiet, wait=False, stop_requested=lambda: None, say=print):
+        assert not place.stop_file.exists()
+
+
+def test_tasks_may_freeze_their_grid_all_at_once(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        places = list(pool.map(lambda _: adopt(grid, tmp_path / "root"), range(32)))
+    assert {place.folder for place in places} == {tmp_path / "root" / manifest.name}
+    assert places[0].manifest() == manifest
+    assert places[0].instance_files(manifest) == grid.instance_files(manifest)
 
 
 # ---- what the scripts do --------------------------------------------------------------------------------------------

@@ -257,6 +257,7 @@ def grid_stop(
 ) -> None:
     """Have all runs make a checkpoint and end. Running or submitting the grid again goes on from there."""
     from space_dist.manifest import find_grid
+    from space_dist.slurm.queue import queue_of
 
     place = find_grid(grid, _root(root))
     manifest = place.manifest()
@@ -271,13 +272,16 @@ def grid_stop(
         say(f"{manifest.name}: job {conductor.submission_id} was asked to stop its runs, and itself")
         return
     live = [standing for standing in _standings(place, manifest) if standing.condition == "running"]
-    if not live and not place.owner_alive():
+    queue = queue_of(place.folder)
+    if not live and not place.owner_alive() and not (queue and queue.live):
         say(f"{manifest.name}: nothing is running")
         return
     place.stop_file.touch()
     for standing in live:  # those nobody conducts any more, too
         standing.ledger.stop_file.touch()
     say(f"{manifest.name}: {len(live)} runs were asked to make a checkpoint and end")
+    if queue and queue.live:
+        say("SLURM jobs that still wait will end as soon as they start; scancel removes them")
 
 
 @grid_app.command("retry")
