@@ -44,8 +44,8 @@ class EnvConfig(Section):
     """The environment."""
 
     id: str = Field(min_length=1, max_length=300)
-    """Registered id (space_dist/PointMass-v0) or import path of a function that makes a batched environment
-    (my_package.my_module:make)."""
+    """Registered id (space_dist/PointMass-v0) or import path (my_package.my_module:make): of a Gymnasium environment
+    with a context_space, of a function that makes one or a batched environment, or of a class of CARL's."""
     kwargs: dict[str, bool | int | float | str] = {}
     """Arguments of the environment, by name. What they mean, and their units, is the environment's."""
     context_visible: bool = True
@@ -460,6 +460,14 @@ class ResourcesConfig(Section):
     """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)
     """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
+    room_seconds: float = Field(default=120.0, gt=0.0)
+    """How long to wait for Ray to have room for all workers at once, and, when nodes are lost, for any of them."""
+    late_factor: float = Field(default=20.0, ge=1.0)
+    """An actor that takes this many times the median of such calls is replaced, and its work done elsewhere..."""
+    late_seconds: float = Field(default=60.0, gt=0.0)
+    """... but none before it has taken so many seconds."""
+    first_answer_seconds: float = Field(default=900.0, gt=0.0)
+    """The same limit for an actor's start, and for calls of a kind that has not been answered yet."""
 
 
 class RunConfig(Section):

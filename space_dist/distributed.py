@@ -2,13 +2,21 @@
 
 Nothing here decides a result. A shard may be computed by any actor; values flow from rollout actors to the curriculum
 actor, and its selection back to them, by object reference, without passing through the driver.
+
+Every call is a pure function that is kept until its answer is here, so whatever is lost is asked for again: an actor
+that died or is late, an object whose only copy was on a lost node, what waited in the queue behind either. Calls go to
+actors that are up; one that is being replaced joins when it is.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
-from collections.abc import Sequence
+import statistics
+import time
+from collections import defaultdict, deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -18,7 +26,9 @@ os.environ.setdefault("RAY_DEDUP_LOGS", "0")
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
-from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
+from ray.exceptions import RayError, RayTaskError
+from ray.util.placement_group import PlacementGroup, placement_group, placement_group_table, remove_placement_group
+from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
 from space_dist.cluster import Central, Decision, Handle
@@ -27,70 +37,104 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.rollout import Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
-_START_SECONDS = 120.0
-_ATTEMPTS = 4
+_ATTEMPTS = 6  # at one call, or at one actor's start, before something must be wrong with the work itself
+_LOOK_SECONDS = 0.2  # between two looks for what died or is late
+_RESCHEDULING_SECONDS = 5.0  # that Ray gets to find other room for a lost node's actors
+_REMEMBERED = 101  # durations per kind of call, whose median says what is late
 _CENTRAL = -1
 _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 
 log = logging.getLogger("space_dist")
 
 
-class RolloutActor(Worker):
+class _Timed:
+    """An actor's side of a call: what it answers, and how long that took."""
+
+    def ready(self) -> bool:
+        """Answers once the actor is up."""
+        return True
+
+    def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
+        """Seconds, and the answer: one object, or each of `several`."""
+        start = time.monotonic()
+        answer = getattr(self, method)(*arguments, **options)
+        seconds = time.monotonic() - start
+        return (seconds, *answer) if several else (seconds, answer)
+
+
+class RolloutActor(_Timed, Worker):
     """A `Worker` in a process of its own, with one thread for its arithmetic."""
 
     def __init__(self, setup: Setup) -> None:
         threadpool_limits(limits=1)
         super().__init__(setup)
 
-    def ready(self) -> bool:
-        """Answers once the actor is up."""
-        return True
 
-
-class CurriculumActor(Central):
+class CurriculumActor(_Timed, Central):
     """The central curriculum: aggregates the start values that all rollout actors send it, and decides."""
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
         threadpool_limits(limits=1)
         super().__init__(config, setup.train)
 
-    def ready(self) -> bool:
-        """Answers once the actor is up."""
-        return True
 
-
-@dataclass
+@dataclass(eq=False)
 class _Piece:
-    """A handle: where a value is, or will be. Recomputing the value moves it."""
+    """A handle: where a value is, or will be. Recomputing the value moves it.
+
+    kept: the driver holds the value too, because nobody could compute it again: what was put, what was decided.
+    """
 
     ref: Any
+    value: Any = None
+    kept: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class _Call:
     """A call of an actor's method, kept until its answer has arrived so that it can be made again."""
 
-    actor: int  # of the rollout actors; _CENTRAL for the curriculum actor
+    piece: int  # of the work, which decides the actor; _CENTRAL for the curriculum actor
     method: str
     arguments: tuple[Any, ...]
     options: dict[str, Any]
     answers: list[_Piece]
+    seat: int = 0  # the actor's
+    actor: Any = None
+    seconds: Any = None  # reference of how long it took: small, so it comes to the driver by itself
+    number: int = 0  # in the order of submission, in which actors work
+    answered: bool = False
+    attempts: int = 0
+    late: int = 0  # times
+    since: float | None = None  # when its turn came, on the cluster's clock
+
+    @property
+    def pieces(self) -> list[_Piece]:
+        """The arguments that are handles."""
+        return [argument for argument in self.arguments if isinstance(argument, _Piece)]
 
 
 class RayCluster:
     """Rollout actors and one curriculum actor; a context manager that leaves nothing behind.
 
-    An actor that dies is replaced, and what it owed is computed again: every call is a pure function, so nothing but
-    time is lost. Raises SpaceDistError if Ray cannot be reached or has no room for the actors.
+    The rollout actors' CPUs are held in one placement group, so that a run has all its room or none. An actor that
+    dies, or is late, is replaced, and what it owed is computed elsewhere; if a node is lost and the others have no room
+    for its actors, the run goes on with fewer. Raises SpaceDistError if Ray cannot be reached or has no room.
     """
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._config, self._setup = config, setup
-        self._actors: dict[int, Any] = {}
+        self._config, self._resources, self._setup = config, config.resources, setup
+        self._room: PlacementGroup | None = None
+        self._actors: dict[int, Any] = {}  # by seat
+        self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
+        self._failed_starts: dict[int, int] = defaultdict(int)
         self._unanswered: list[_Call] = []
+        self._submitted = 0
+        self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
+        self._clock = 0.0  # seconds spent waiting: a driver that was itself stopped, or busy, blames nobody
 
     def __enter__(self) -> RayCluster:
-        resources = self._config.resources
+        resources = self._resources
         try:
             if resources.address == "local":
                 ray.init(
@@ -107,10 +151,12 @@ class RayCluster:
                 f"{str(error).splitlines()[0] if str(error) else type(error).__name__}"
             ) from error
         try:
-            self._setup_ref = ray.put(self._setup)
-            for index in (*range(resources.workers), _CENTRAL):
-                self._actors[index] = self._start_actor(index)
-            self._wait_until_ready()
+            self._setup_piece = self.put(self._setup)
+            if not self._take_room(resources.workers, resources.room_seconds):
+                raise self._no_room(resources.workers)
+            self._start((*range(resources.workers), _CENTRAL))
+            while self._starting:
+                self._look_after_starting()
         except BaseException:
             ray.shutdown()
             raise
@@ -119,13 +165,15 @@ class RayCluster:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for actor in self._actors.values():
-            ray.kill(actor)
+        with contextlib.suppress(RayError):
+            for actor in self._actors.values():
+                ray.kill(actor)
+            self._leave_room()
         ray.shutdown()
 
     def put(self, value: object) -> Handle:
         """See `cluster.Cluster`."""
-        return _Piece(ray.put(value))
+        return _Piece(ray.put(value), value, kept=True)
 
     def collect(
         self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
@@ -158,72 +206,242 @@ class RayCluster:
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""
-        for _ in range(_ATTEMPTS):
+        decided = [piece for call in self._unanswered if call.piece == _CENTRAL for piece in call.answers]
+        wanted = [piece for piece in dict.fromkeys([*handles, *decided]) if not piece.kept]
+        while True:
+            self._wait_for_answers()
             try:
-                values = ray.get([handle.ref for handle in handles])
+                values = ray.get([piece.ref for piece in wanted], timeout=self._resources.first_answer_seconds)
+                break
             except RayTaskError as error:
                 raise _cause(error) from error
-            except RayError as error:
-                log.warning("lost a part of the run (%s); computing it again", type(error).__name__)
-                lost = error
-                self._replace_dead()
-                self._ask_again()
-            else:
-                self._unanswered.clear()
-                return list(values)
-        raise SpaceDistError(
-            f"the same work was lost {_ATTEMPTS} times ({type(lost).__name__}: {str(lost).splitlines()[0][:200]}). "
-            "What was committed is intact; --resume continues"
-        ) from lost
+            except RayError as error:  # it had been computed, and was lost with a node before it came here
+                self._ask_again(set(), set(self._unanswered), error)
+        arrived = dict(zip(wanted, values, strict=True))
+        for piece in decided:  # the next decision needs it, and nobody could make it again
+            piece.value, piece.kept = arrived[piece], True
+        self._unanswered.clear()
+        return [handle.value if handle.kept else arrived[handle] for handle in handles]
+
+    # ---- calls ----
 
     def _ask(self, piece: int, method: str, *arguments: Any, **options: Any) -> list[_Piece]:
-        actor = piece if piece == _CENTRAL else piece % self._config.resources.workers
-        answers = [_Piece(None) for _ in range(_CENTRAL_ANSWERS if actor == _CENTRAL else 1)]
-        call = _Call(actor, method, arguments, options, answers)
+        answers = [_Piece(None) for _ in range(_CENTRAL_ANSWERS if piece == _CENTRAL else 1)]
+        call = _Call(piece, method, arguments, options, answers)
         self._unanswered.append(call)
         self._submit(call)
         return answers
 
     def _submit(self, call: _Call) -> None:
-        method = getattr(self._actors[call.actor], call.method).options(num_returns=len(call.answers))
+        call.seat = _CENTRAL if call.piece == _CENTRAL else self._seat_for(call.piece)
+        call.actor, call.since, call.answered = self._actors[call.seat], None, False
+        call.number = self._submitted = self._submitted + 1
+        several = len(call.answers) > 1
         arguments = [argument.ref if isinstance(argument, _Piece) else argument for argument in call.arguments]
-        refs = method.remote(*arguments, **call.options)
-        for piece, ref in zip(call.answers, refs if len(call.answers) > 1 else [refs], strict=True):
+        method = call.actor.timed.options(num_returns=1 + len(call.answers))
+        call.seconds, *refs = method.remote(call.method, several, *arguments, **call.options)
+        for piece, ref in zip(call.answers, refs, strict=True):
             piece.ref = ref
 
-    def _ask_again(self) -> None:
+    def _wait_for_answers(self) -> None:
+        while waiting := [call for call in self._unanswered if not call.answered]:
+            start = time.monotonic()
+            refs = [call.seconds for call in waiting]
+            ready, _ = ray.wait(refs, num_returns=len(refs), timeout=_LOOK_SECONDS, fetch_local=False)
+            self._clock += min(time.monotonic() - start, 2 * _LOOK_SECONDS)
+            self._look_after_starting(wait=False)
+            arrived = set(ready)
+            dead, lost, reason = set(), set(), None
+            for call in waiting:
+                if call.seconds in arrived:
+                    try:
+                        self._seconds[call.method].append(ray.get(call.seconds))
+                        call.answered = True
+                    except RayError as error:
+                        if not _is_loss(error):
+                            raise _cause(error) from error
+                        reason = error
+                        lost.add(call)
+                        if isinstance(error, RayTaskError):  # its actor lives; an argument was lost
+                            lost |= self._makers(call)
+                        elif self._actors.get(call.seat) is call.actor:
+                            dead.add(call.seat)
+            late = self._late()
+            if dead or lost or late:
+                self._replace(dead | late)
+                self._ask_again(dead | late, lost, reason)
+
+    def _makers(self, call: _Call) -> set[_Call]:
+        """The answered calls whose answers were this one's arguments."""
+        return {one for one in self._unanswered if one.answered and not set(one.answers).isdisjoint(call.pieces)}
+
+    def _late(self) -> set[int]:
+        """Seats whose actor has been at its turn for much longer than such calls take."""
+        turns: dict[int, _Call] = {}
+        for call in sorted((one for one in self._unanswered if not one.answered), key=lambda one: one.number):
+            turns.setdefault(call.seat, call)
+        coming = {piece for call in self._unanswered if not call.answered for piece in call.answers}
+        late = set()
+        for seat, call in turns.items():
+            if seat in self._starting or any(piece in coming for piece in call.pieces):
+                call.since = None  # it waits for somebody else
+            elif call.since is None:
+                call.since = self._clock
+            elif self._clock - call.since > self._patience(call):
+                log.warning(
+                    "%s has not answered for %.0f s where %s takes %.2g s; replacing it",
+                    _name(seat), self._clock - call.since, call.method, self._usual_seconds(call),
+                )  # fmt: skip
+                call.late += 1
+                late.add(seat)
+        return late
+
+    def _usual_seconds(self, call: _Call) -> float:
+        return statistics.median(self._seconds[call.method] or [0.0])
+
+    def _patience(self, call: _Call) -> float:
+        """Seconds; more for a call that was found late before: a false alarm must cost nothing but time."""
+        resources = self._resources
+        if not self._seconds[call.method]:
+            return resources.first_answer_seconds * 2.0**call.late
+        return max(resources.late_seconds, resources.late_factor * self._usual_seconds(call)) * 2.0**call.late
+
+    def _ask_again(self, seats: set[int], lost: set[_Call], reason: Exception | None) -> None:
+        """Submit anew what the actors of `seats` owed, what was `lost`, and what was to use either."""
+        if reason is not None:
+            log.warning("lost a part of the run (%s); computing it again", type(reason).__name__)
+        moved = {piece for call in lost for piece in call.pieces if piece.kept}
+        for piece in moved:
+            piece.ref = ray.put(piece.value)
         for call in self._unanswered:  # in the order of submission, so that arguments are asked for before their users
-            self._submit(call)
+            owed = call.seat in seats and not call.answered
+            if call in lost or owed or (not call.answered and not moved.isdisjoint(call.pieces)):
+                call.attempts += 1
+                if call.attempts == _ATTEMPTS:
+                    what = "took too long" if reason is None else f"{type(reason).__name__}: {_first_line(reason)}"
+                    raise SpaceDistError(
+                        f"the same work was lost {_ATTEMPTS} times ({what}). What was committed is intact; "
+                        "--resume continues"
+                    ) from reason
+                self._submit(call)
+                moved.update(call.answers)
 
-    def _replace_dead(self) -> None:
-        for index, actor in self._actors.items():
-            try:
-                ray.get(actor.ready.remote(), timeout=_START_SECONDS)
-            except RayActorError:
-                self._actors[index] = self._start_actor(index)
-            except GetTimeoutError:
-                ray.kill(actor)
-                self._actors[index] = self._start_actor(index)
-        self._wait_until_ready()
+    # ---- actors ----
 
-    def _start_actor(self, index: int) -> Any:
-        # Never restarted by Ray: an actor that came back blank would go on silently.
-        if index == _CENTRAL:
-            return ray.remote(num_cpus=0, max_restarts=0)(CurriculumActor).remote(self._config, self._setup_ref)
-        return ray.remote(num_cpus=1, max_restarts=0)(RolloutActor).remote(self._setup_ref)
+    def _seat_for(self, piece: int) -> int:
+        """The rollout actor for a piece of work: the same one as long as none is lost."""
+        while not (seats := sorted(seat for seat in self._actors if seat not in (_CENTRAL, *self._starting))):
+            self._find_other_room()
+        return seats[piece % len(seats)]
 
-    def _wait_until_ready(self) -> None:
-        try:
-            ray.get([actor.ready.remote() for actor in self._actors.values()], timeout=_START_SECONDS)
-        except GetTimeoutError:
-            total, free = _cpus()
-            raise SpaceDistError(
-                f"Ray did not start {self._config.resources.workers} rollout actors of one CPU each within "
-                f"{_START_SECONDS:.0f} s; the cluster has {total:.0f} CPUs, {free:.0f} of them free"
-            ) from None
-        except RayActorError as error:
-            cause = error.__cause__ if isinstance(error.__cause__, SpaceDistError) else None
-            raise cause or SpaceDistError(f"an actor died as it started: {str(error).splitlines()[0][:300]}") from error
+    def _start(self, seats: Iterable[int]) -> None:
+        """Start actors; they are up once `_look_after_starting` has seen it."""
+        if self._room is None:
+            raise RuntimeError("actors are started in a room")
+        for seat in seats:
+            # Never restarted by Ray: an actor that came back blank would go on silently.
+            inside = PlacementGroupSchedulingStrategy(self._room, placement_group_bundle_index=-1)
+            options: dict[str, Any] = {"max_restarts": 0, "scheduling_strategy": inside}
+            setup = self._setup_piece.ref
+            self._actors[seat] = (
+                ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup)
+                if seat == _CENTRAL
+                else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup)
+            )
+            self._starting[seat] = (self._actors[seat].ready.remote(), time.monotonic())
+
+    def _replace(self, seats: Iterable[int]) -> None:
+        for seat in seats:
+            with contextlib.suppress(RayError):
+                ray.kill(self._actors[seat])  # which also answers whoever waits for what it owed
+        self._start(seats)
+
+    def _look_after_starting(self, *, wait: bool = True) -> None:
+        """Notice which actors are up by now, and start those again that died before. Raises what stopped them."""
+        refs = [ref for ref, _ in self._starting.values()]
+        if not refs:
+            return
+        arrived = set(ray.wait(refs, timeout=_LOOK_SECONDS if wait else 0, fetch_local=False)[0])
+        for seat, (ref, since) in list(self._starting.items()):
+            if ref in arrived:
+                try:
+                    ray.get(ref)
+                except RayError as error:
+                    self._retry_start(seat, error)
+                else:
+                    del self._starting[seat]
+                    self._failed_starts[seat] = 0
+            elif time.monotonic() - since > self._resources.first_answer_seconds:
+                log.warning("%s did not start; trying again", _name(seat))
+                self._retry_start(seat, None)
+
+    def _retry_start(self, seat: int, error: RayError | None) -> None:
+        cause = None if error is None else error.__cause__
+        self._failed_starts[seat] += 1
+        if isinstance(cause, SpaceDistError):
+            raise cause
+        if isinstance(cause, RayTaskError) and not _is_loss(cause):  # its environment's or policy's own fault
+            raise _cause(cause) from error
+        if self._failed_starts[seat] == _ATTEMPTS:
+            what = "no sign of life" if error is None else _first_line(error)
+            raise SpaceDistError(f"{_name(seat)} died as it started: {what}") from error
+        if error is not None:
+            self._setup_piece.ref = ray.put(self._setup)  # it may be what was lost
+        self._replace([seat])
+
+    # ---- room ----
+
+    def _take_room(self, workers: int, seconds: float) -> bool:
+        """Hold one CPU for each rollout actor, near to each other; False if there is no room within the time."""
+        self._room = placement_group([{"CPU": 1.0}] * workers, strategy="PACK")
+        if self._room.wait(max(1.0, seconds)):
+            return True
+        self._leave_room()
+        return False
+
+    def _leave_room(self) -> None:
+        if self._room is not None:
+            remove_placement_group(self._room)
+            self._room = None
+
+    def _find_other_room(self) -> None:
+        """Wait for a rollout actor to come up; if Ray finds no room for all of them any more, hold what there is."""
+        start, seconds = time.monotonic(), self._resources.room_seconds
+        while self._actors.keys() - {_CENTRAL} <= self._starting.keys():
+            self._look_after_starting()
+            waited = time.monotonic() - start
+            if waited > min(_RESCHEDULING_SECONDS, seconds) and not self._has_room():
+                for actor in self._actors.values():
+                    with contextlib.suppress(RayError):
+                        ray.kill(actor)
+                self._actors, self._starting = {}, {}
+                self._leave_room()
+                workers = max(1, min(self._resources.workers, int(_cpus()[1])))
+                if not self._take_room(workers, _RESCHEDULING_SECONDS):
+                    if waited > seconds:
+                        raise self._no_room(workers)
+                    continue
+                log.warning("room is left for %d of %d rollout actors", workers, self._resources.workers)
+                self._start((*range(workers), _CENTRAL))
+
+    def _has_room(self) -> bool:
+        return self._room is not None and placement_group_table(self._room)["state"] == "CREATED"
+
+    def _no_room(self, workers: int) -> SpaceDistError:
+        total, free = _cpus()
+        return SpaceDistError(
+            f"Ray has no room for {workers} rollout actors of one CPU each: in {self._resources.room_seconds:.0f} s "
+            f"(resources.room_seconds) none was found; the cluster has {total:.0f} CPUs, {free:.0f} of them free. "
+            "Fewer fit with --workers"
+        )
+
+
+def _name(seat: int) -> str:
+    return "the curriculum actor" if seat == _CENTRAL else f"rollout actor {seat}"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
 
 
 def _cpus() -> tuple[float, float]:
@@ -233,9 +451,16 @@ def _cpus() -> tuple[float, float]:
     return total.get("CPU", 0.0), free.get("CPU", 0.0)
 
 
-def _cause(error: RayTaskError) -> Exception:
+def _is_loss(error: BaseException | None) -> bool:
+    """Whether a part of Ray failed, and not the work itself: directly, or as an argument of a call."""
+    while isinstance(error, RayTaskError):
+        error = error.cause
+    return isinstance(error, RayError)
+
+
+def _cause(error: RayError) -> Exception:
     """What the code in the actor raised: our own errors as they are, others as a sentence."""
-    cause = error.cause if isinstance(error.cause, Exception) else error
+    cause = error.cause if isinstance(error, RayTaskError) and isinstance(error.cause, Exception) else error
     if isinstance(cause, SpaceDistError):
         kind = ConfigError if isinstance(cause, ConfigError) else SpaceDistError
         return kind(str(cause.args[0]) if cause.args else str(cause))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import ConfigError, nearest
+from space_dist.mazes import CELLS, SIDE, carve, symmetrised
 from space_dist.seeding import Purpose, generator
 
 MAX_FILE_BYTES: Final = 512 * 2**20
@@ -435,15 +436,44 @@ CARTPOLE_BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), h
 four of `cartpole_test.csv` are ours: one between each two of them, and one beyond each end.
 """
 
+ANTGOAL_BOUNDS: Final = ContextBounds(
+    names=("goal_x", "goal_y", "disabled_leg"),
+    low=np.array([-750.0, -750.0, -1.0]),
+    high=np.array([750.0, 750.0, 3.0]),
+)
+"""AntGoal (Eimer et al. 2021): the goal in metres from the start, and the disabled leg, a whole number: -1 for none."""
+
+BALLCATCHING_BOUNDS: Final = ContextBounds(
+    names=("angle", "radius", "distance"),
+    low=np.array([0.125 * np.pi, 0.52, 0.75]),
+    high=np.array([0.5 * np.pi, 0.95, 4.0]),
+)
+"""BallCatching (Klink et al. 2020): angle in radians and radius in metres of the point that the ball flies to, seen
+from the arm's shoulder, and the distance in metres from which it comes.
+
+Klink et al. have radii from 0.6 to 1.1 for their longer arm: ours are these times 0.95 / 1.1, because the net's centre
+reaches 1.07 m.
+"""
+MAZE_BOUNDS: Final = ContextBounds(
+    names=tuple(f"cell_{x}_{y}" for y in range(SIDE) for x in range(SIDE)),
+    low=np.zeros(CELLS),
+    high=np.full(CELLS, 15.0),
+)
+"""Maze: the bits of each cell's open sides (north 1, east 2, south 4, west 8), in reading order; `cell_x_y`."""
+
 
 @dataclass(frozen=True)
 class Distribution:
-    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows."""
+    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows.
+
+    `content` turns `(n, d)` contexts into rows that are equal where two contexts mean the same.
+    """
 
     description: str
     source: str
     bounds: ContextBounds
     draw: Callable[[np.random.Generator, int], NDArray[np.float64]]
+    content: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda contexts: contexts
 
 
 def _draw_pointmass_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
@@ -458,6 +488,12 @@ def _draw_pointmass_target(rng: np.random.Generator, n: int) -> NDArray[np.float
     """
     drawn = rng.normal((2.5, 0.5, 0.0), (4e-3, 3.75e-3, 2e-3), size=(n, 3))
     return np.clip(drawn, POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high)
+
+
+def _draw_antgoal(rng: np.random.Generator, n: int, nearest_goal: float) -> NDArray[np.float64]:
+    """Goals uniform between `nearest_goal` and 750 on each axis; none or one of four legs, each as likely."""
+    goals = rng.uniform(nearest_goal, ANTGOAL_BOUNDS.high[:2], size=(n, 2))
+    return np.column_stack((goals, rng.integers(-1, 4, size=n)))
 
 
 DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
@@ -480,20 +516,57 @@ DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
         bounds=CARTPOLE_BOUNDS,
         draw=lambda rng, n: rng.uniform(CARTPOLE_BOUNDS.low, CARTPOLE_BOUNDS.high, size=(n, 1)),
     ),
+    "antgoal_positive": Distribution(
+        description="AntGoal, goals uniform in the positive quadrant up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021; the quadrant is the released code's",
+        bounds=ANTGOAL_BOUNDS,
+        draw=lambda rng, n: _draw_antgoal(rng, n, 0.0),
+    ),
+    "antgoal_all": Distribution(
+        description="AntGoal, goals uniform in all four quadrants up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021 (goals at most 750 away)",
+        bounds=ANTGOAL_BOUNDS,
+        draw=lambda rng, n: _draw_antgoal(rng, n, -750.0),
+    ),
+    "ballcatching_uniform": Distribution(
+        description="BallCatching, each feature uniform within its bounds",
+        source="Klink et al. 2020 (the bounds); the radius is scaled to our arm",
+        bounds=BALLCATCHING_BOUNDS,
+        draw=lambda rng, n: rng.uniform(BALLCATCHING_BOUNDS.low, BALLCATCHING_BOUNDS.high, size=(n, 3)),
+    ),
+    "maze_dfs": Distribution(
+        description="Maze, perfect 5x5 mazes carved depth first from a random cell, symmetrised",
+        source="gym-maze's generator; the paper released no settings",
+        bounds=MAZE_BOUNDS,
+        draw=carve,
+    ),
+    "maze_dfs_raw": Distribution(
+        description="Maze, the mazes of maze_dfs with the released code's numbers, which depend on where the carving "
+        "began",
+        source="gym-maze's generator",
+        bounds=MAZE_BOUNDS,
+        draw=lambda rng, n: carve(rng, n, raw=True),
+        content=symmetrised,
+    ),
 }
 
 
-def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[InstanceSet, InstanceSet]:
-    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), drawn from one of `DISTRIBUTIONS`.
+def sample(
+    distribution: str, n_train: int, n_test: int, seed: int, known: Mapping[str, Distribution] | None = None
+) -> tuple[InstanceSet, InstanceSet]:
+    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), from one of the `known` (DISTRIBUTIONS).
 
     They are disjoint by construction: one set of distinct contexts is drawn, what repeats drawn again, and then
-    split. A pure function of all four arguments. Raises ConfigError for an unknown distribution, for counts below 1
+    split. A pure function of its arguments. Raises ConfigError for an unknown distribution, for counts below 1
     or above 10 million together, for a negative seed, and if there are not that many distinct contexts to be found.
     """
-    if distribution not in DISTRIBUTIONS:
+    known = DISTRIBUTIONS if known is None else known
+    if distribution not in known:
         raise ConfigError(
-            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], DISTRIBUTIONS)} "
-            f"(known are {', '.join(DISTRIBUTIONS)})"
+            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], known)} "
+            f"(known are {', '.join(known)})"
         )
     total = n_train + n_test
     if min(n_train, n_test) < 1 or total > MAX_INSTANCES:
@@ -503,12 +576,12 @@ def sample(distribution: str, n_train: int, n_test: int, seed: int) -> tuple[Ins
         )
     if seed < 0:
         raise ConfigError(f"the seed {seed} is negative; allowed are whole numbers from 0")
-    chosen = DISTRIBUTIONS[distribution]
+    chosen = known[distribution]
     rng = generator(seed, Purpose.INSTANCES, int.from_bytes(distribution.encode(), "big"), n_train, n_test)
     contexts = np.empty((0, len(chosen.bounds.names)))
     for _ in range(MAX_REDRAWS):
         contexts = np.vstack((contexts, chosen.draw(rng, total - len(contexts))))
-        contexts = np.delete(contexts, _repeats(contexts)[1], axis=0)
+        contexts = np.delete(contexts, _repeats(chosen.content(contexts))[1], axis=0)
         if len(contexts) == total:
             ids, names = np.arange(total), chosen.bounds.names
             train = InstanceSet(ids[:n_train], contexts[:n_train], names)

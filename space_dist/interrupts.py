@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from space_dist.errors import Interrupted
 
@@ -24,11 +27,31 @@ class StopRequests:
         self._reason: str | None = None
         self._file: Path | None = None
         self._grace_seconds = 25.0
+        self._installed = False
 
     def install(self) -> None:
-        """Set the handlers; to be called again after whatever replaces them (`ray.init` takes SIGTERM)."""
+        """Set the handlers."""
+        self._installed = True
         for number in STOP_SIGNALS:
             signal.signal(number, self._on_signal)
+
+    @contextmanager
+    def standing(self) -> Iterator[None]:
+        """Keep the handlers, if they are set, while something runs that replaces them: `ray.init`, for seconds."""
+        if not self._installed:
+            yield
+            return
+        replace = signal.signal
+
+        def keep_ours(number: int, handler: Any) -> Any:
+            return signal.getsignal(number) if number in STOP_SIGNALS else replace(number, handler)
+
+        signal.signal = keep_ours  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            signal.signal = replace
+            self.install()
 
     def watch(self, stop_file: Path, grace_seconds: float) -> None:
         """Also stop once `stop_file` exists."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import logging
 import os
@@ -104,11 +105,22 @@ def launch(
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
+            _stop_if_asked(writer, stop)  # before Ray is started
             with _cluster(config, setup, stop) as cluster:
+                _stop_if_asked(writer, stop)
                 Training(
                     config, setup, cluster, writer, status=status, stop_requested=stop.reason, observe=observe
                 ).run()
     return Outcome(ledger, tracking_warning=_final_push(config, ledger, pusher))
+
+
+def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
+    """Stop before the first round. Raises Interrupted; what was committed by then is all there is."""
+    reason = stop.reason()
+    if reason is not None and writer.status is not None:
+        message = f"stopped by {reason} before its first round; --resume continues"
+        writer.set_status(replace(writer.status, state="interrupted", message=reason, updated_at=time.time()))
+        raise Interrupted(message)
 
 
 def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
@@ -118,17 +130,21 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
     status = Status(
         state="running", name=config.name, seed=config.seed, steps=0, budget_steps=config.budget.steps, round=0,
         started_at=now, updated_at=now, fingerprint=here,
+        identity=configs.identity(config, setup.train.digest(), setup.test.digest()),
     )  # fmt: skip
-    if ledger.config.exists():
-        _refuse_other_run(config, setup, ledger)
-    if ledger.status_file.exists():
-        before = writer.status = ledger.status()
+    before = writer.status = _status_before(ledger)
+    _refuse_other_run(config, setup, ledger, status.identity, before)
+    if before is not None:
         if before.state == "done":
-            return before
+            damage = ledger.damage()
+            if not damage:
+                return before
+            for sentence in damage:
+                log.warning("%s; computing it again from the last checkpoint", sentence)
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
         status = replace(
             status, steps=before.steps, round=before.round, started_at=before.started_at,
-            fingerprint_changed=before.fingerprint_changed or changed,
+            fingerprint_changed=before.fingerprint_changed or changed, identity=before.identity or status.identity,
         )  # fmt: skip
     writer.write_config(configs.dump(_self_contained(config)), setup.train.to_csv(), setup.test.to_csv())
     ledger.stop_file.unlink(missing_ok=True)
@@ -136,11 +152,48 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
     return status
 
 
-def _refuse_other_run(config: RunConfig, setup: Setup, ledger: Ledger) -> None:
-    stored = configs.load(ledger.config)
-    train, test = read_instances(stored)
-    same = configs.identity(config, setup.train.digest(), setup.test.digest())
-    if same == configs.identity(stored, train.digest(), test.digest()):
+def _status_before(ledger: Ledger) -> Status | None:
+    """Where the run stood: as its status says, or, where that is damaged or gone, its newest intact checkpoint."""
+    try:
+        return ledger.status() if ledger.status_file.exists() else _status_in(ledger)
+    except LedgerError as error:
+        status = _status_in(ledger)
+        if status is None:
+            raise
+        log.warning("%s; going on from the checkpoint of round %d", error, status.round)
+        return status
+
+
+def _status_in(ledger: Ledger) -> Status | None:
+    """A status from the newest intact checkpoint, which knows what decides whether and how the run may go on."""
+    for file in ledger.checkpoint_files():
+        with contextlib.suppress(ValueError, OSError):
+            checkpoint = decode_checkpoint(file.read_bytes())
+            about, now = checkpoint.data.get("about", {}), time.time()
+            return Status(
+                state="running", name="", seed=0, steps=about.get("steps", 0), budget_steps=0, round=checkpoint.round,
+                started_at=now, updated_at=now, checkpoint=file.name, identity=about.get("identity"),
+                fingerprint=about.get("fingerprint", {}), fingerprint_changed=about.get("fingerprint_changed", False),
+            )  # fmt: skip
+    return None
+
+
+def _refuse_other_run(
+    config: RunConfig, setup: Setup, ledger: Ledger, identity: str | None, before: Status | None
+) -> None:
+    """Raise ConfigError if the folder holds a run of another configuration, with what differs where that is known."""
+    if before is not None and before.identity == identity:
+        return  # the copies of config and instances in the folder are written anew
+    if before is None and not ledger.config.exists():
+        return
+    try:  # the stored config decides as this version reads it, if it is known to be what the run wrote
+        stored = configs.load(ledger.config) if before is None else stored_config(ledger)
+        train, test = read_instances(stored)
+    except LedgerError as error:
+        raise ConfigError(
+            f"{ledger.folder} holds a run of another configuration; which cannot be told: {error}"
+        ) from error
+    if identity == configs.identity(stored, train.digest(), test.digest()):
         return
     changes = configs.differences(stored, config)
     if (train.digest(), test.digest()) != (setup.train.digest(), setup.test.digest()):
@@ -149,6 +202,12 @@ def _refuse_other_run(config: RunConfig, setup: Setup, ledger: Ledger) -> None:
         f"{ledger.folder} holds a run of another configuration ({'; '.join(changes)}). A run's settings cannot change "
         "on the way: use --out DIR for a new run"
     )
+
+
+def stored_config(ledger: Ledger) -> RunConfig:
+    """The config in a run's folder. Raises LedgerError if it is not what the run wrote."""
+    ledger.read(ledger.config)
+    return configs.load(ledger.config)
 
 
 def _self_contained(config: RunConfig) -> RunConfig:
@@ -192,19 +251,24 @@ def lasting(path: Path, option: str) -> Path:
 
 
 def policy_of(ledger: Ledger) -> Policy:
-    """The policy of a finished run, or that of an unfinished one's last checkpoint. Raises LedgerError without any."""
-    if ledger.model_arrays.exists() and ledger.model_description.exists():
+    """The policy of a finished run, or that of an unfinished one's last checkpoint.
+
+    Raises LedgerError where there is none, and where it is damaged.
+    """
+    model = (ledger.model_arrays, ledger.model_description)
+    if ledger.status().state == "done" and all(path.exists() for path in model):
+        content, described = ledger.read(ledger.model_arrays), ledger.read(ledger.model_description)
         try:
-            description = json.loads(ledger.model_description.read_bytes())
+            description = json.loads(described)
             if description["policy"] != "torch":  # those come from the last checkpoint, below
-                with np.load(ledger.model_arrays, allow_pickle=False) as file:
+                with np.load(io.BytesIO(content), allow_pickle=False) as file:
                     return from_arrays(dict(file), description)
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError):
             raise LedgerError(f"the model in {ledger.folder} is damaged (model.npz, model.json)") from None
-    for file in ledger.checkpoint_files():
-        with contextlib.suppress(ValueError, OSError):
-            return policy_in(decode_checkpoint(file.read_bytes()), configs.load(ledger.config))
-    raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
+    checkpoint = ledger.last_checkpoint()
+    if checkpoint is None:
+        raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
+    return policy_in(checkpoint, stored_config(ledger))
 
 
 def private_ray() -> None:
@@ -226,8 +290,9 @@ def _cluster(config: RunConfig, setup: Setup, stop: StopRequests) -> Iterator[Cl
         private_ray()
     from space_dist.distributed import RayCluster  # Ray takes a second to import and is not needed without workers
 
-    with RayCluster(config, setup) as cluster:
-        stop.install()  # ray.init replaced SIGTERM's handler
+    with contextlib.ExitStack() as stack:
+        with stop.standing():  # ray.init would replace SIGTERM's handler
+            cluster = stack.enter_context(RayCluster(config, setup))
         yield cluster
 
 
@@ -265,6 +330,7 @@ def _logging_to(path: Path) -> Iterator[None]:
         handler = logging.FileHandler(path)
     except OSError as error:
         raise LedgerError(f"cannot write {path}: {error.strerror}") from None
+    handler.handleError = lambda record: None  # type: ignore[method-assign] # a full disk is the ledger's to tell
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     log.addHandler(handler)
     log.setLevel(logging.INFO)
@@ -280,11 +346,15 @@ def _start_pusher(config: RunConfig, ledger: Ledger) -> subprocess.Popen[bytes] 
     if config.tracking.uri is None or not config.tracking.live:
         return None
     command = [sys.executable, "-m", "space_dist.cli", "sync", "--follow", "--", str(ledger.folder)]
-    with (ledger.folder / "tracking.log").open("ab") as output:
-        # A session of its own: Ctrl-C is for the run; the pusher ends by itself once the run has.
-        return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
-        )  # fmt: skip
+    try:
+        with (ledger.folder / "tracking.log").open("ab") as output:
+            # A session of its own: Ctrl-C is for the run; the pusher ends by itself once the run has.
+            return subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+            )  # fmt: skip
+    except OSError as error:
+        log.warning("nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", error)
+        return None
 
 
 def _final_push(config: RunConfig, ledger: Ledger, pusher: subprocess.Popen[bytes] | None) -> str | None:

@@ -1,7 +1,8 @@
 """A run's own folder: the truth about it.
 
     config.yaml           what was asked for, resolved; with instances_train.csv and instances_test.csv beside it
-    status.json           where the run stands (atomic); names the last checkpoint and how much of each file it covers
+    status.json           where the run stands (atomic); names the last checkpoint, how much of each file it covers, and
+                          the hashes of the files that are written whole
     metrics.jsonl         one row per iteration and per evaluation; a pure function of config and seed
     curriculum.jsonl      one row per iteration: which instances were trained on
     timing.jsonl          one row per row of metrics.jsonl: when, and how long it took
@@ -12,7 +13,8 @@
 
 Rows carry a CRC. Rows behind the last checkpoint are *uncommitted*: a resumed run cuts them off and writes the same
 bytes again. Commits are ordered so that a kill between any two system calls leaves a folder that resumes: rows are
-flushed to disk, then the checkpoint is renamed into place, then the status.
+flushed to disk, then the checkpoint is renamed into place, then the status. A checkpoint holds a hash of itself, of the
+rows and pieces it covers, and of the configuration it belongs to; what is damaged is noticed before it is used.
 """
 
 from __future__ import annotations
@@ -21,9 +23,11 @@ import contextlib
 import dataclasses
 import errno
 import fcntl
+import functools
 import hashlib
 import io
 import json
+import logging
 import os
 import socket
 import threading
@@ -31,7 +35,7 @@ import time
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
@@ -39,6 +43,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import LedgerError, RunLockedError
+
+log = logging.getLogger("space_dist")
 
 Row = dict[str, Any]
 State = Literal["running", "interrupted", "failed", "done"]
@@ -50,6 +56,8 @@ KEPT_CHECKPOINTS = 2
 LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
 HEARTBEAT_SECONDS = 10.0
 _MAX_STATUS_BYTES = 1 << 20
+_READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
+_TEMPORARY = ".*.tmp"
 _CRC_LENGTH = len(',"crc":"00000000"}\n')
 
 
@@ -69,6 +77,9 @@ class Status:
     committed: Mapping[str, int] = dataclasses.field(default_factory=dict)  # file name -> bytes under a checkpoint
     checkpoint: str | None = None
     checkpoint_sha256: str | None = None
+    # Name -> SHA-256 of the files that are written whole: two of a file that is just being replaced
+    files: Mapping[str, list[str]] = dataclasses.field(default_factory=dict)
+    identity: str | None = None  # a hash of everything that decides the run's results
     fingerprint: Mapping[str, str] = dataclasses.field(default_factory=dict)
     fingerprint_changed: bool = False  # resumed where bit-equality is not promised
     format: int = FORMAT
@@ -100,7 +111,7 @@ class Segment:
 
 def atomic_write(path: Path, content: bytes) -> None:
     """Write a whole file or nothing, and be sure that it is on disk."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(_TEMPORARY.replace("*", path.name))
     with temporary.open("wb") as file:
         file.write(content)
         file.flush()
@@ -184,31 +195,76 @@ class Ledger:
     def rows(self, name: str = METRICS, *, committed_only: bool = False) -> list[Row]:
         """The intact rows of a file from its start; a torn last row (a run being written or killed) is left out.
 
-        Raises LedgerError if a row before the last one is damaged, naming file and row.
+        Raises LedgerError if a row before the last one is damaged, naming file and row, and if rows that a checkpoint
+        covers are gone.
         """
         path = self.folder / name
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise LedgerError(f"{path} cannot be read: {error.strerror}") from None
+        for _ in range(_READINGS):  # a run that is resumed from an earlier checkpoint says so before it cuts its rows
+            committed = self.status().committed.get(name, 0) if committed_only or self.status_file.exists() else 0
+            content = _read(path, missing=b"")
+            if len(content) >= committed:
+                break
+        else:
+            raise LedgerError(
+                f"{path} is damaged: it holds {len(content)} bytes of the {committed} that were committed"
+            )
         if committed_only:
-            content = content[: self.status().committed.get(name, 0)]
+            content = content[:committed]
         lines = content.splitlines(keepends=True)
-        rows = []
+        rows, intact = [], 0
         for number, line in enumerate(lines, start=1):
             row = decode_row(line)
             if row is None:
-                if number == len(lines) and not line.endswith(b"\n"):
+                if number == len(lines) and not line.endswith(b"\n") and intact >= committed:
                     break
                 raise LedgerError(f"{path}, row {number}: damaged (its checksum does not match)")
             rows.append(row)
+            intact += len(line)
         return rows
+
+    def read(self, path: Path) -> bytes:
+        """A file of the run that is written whole (config, instances, model), as its writer left it.
+
+        Raises LedgerError if it is missing, cannot be read, or is not what `status.json` says it is.
+        """
+        for _ in range(_READINGS):
+            content = _read(path)
+            known = self.status().files.get(path.name)
+            if known is None or hashlib.sha256(content).hexdigest() in known:
+                return content
+        raise LedgerError(f"{path} is damaged: its checksum is not the one that status.json names")
+
+    def damage(self) -> list[str]:
+        """What of a run's results and of what it was asked is no longer as `status.json` says, one sentence each."""
+        checks: list[Callable[[], object]] = [
+            functools.partial(self.read, self.folder / name) for name in self.status().files
+        ]
+        checks += [functools.partial(self.rows, name, committed_only=True) for name in ROW_FILES]
+        found = []
+        for check in checks:
+            try:
+                check()
+            except LedgerError as error:
+                found.append(str(error))
+        return found
 
     def checkpoint_files(self) -> list[Path]:
         """Newest first."""
         return sorted(self.checkpoints.glob("round-*.npz"), reverse=True)
+
+    def last_checkpoint(self) -> Checkpoint | None:
+        """The one that `status.json` names; None before the first. Raises LedgerError if it is damaged or gone."""
+        name = self.status().checkpoint
+        for _ in range(_READINGS):  # a live writer removes the one before the last
+            if name is None:
+                return None
+            with contextlib.suppress(LedgerError, ValueError):
+                return decode_checkpoint(_read(self.checkpoints / name))
+            name = self.status().checkpoint
+        raise LedgerError(
+            f"the last checkpoint in {self.checkpoints}, {name}, is damaged or missing; --resume goes on from the one "
+            "before it"
+        )
 
     def owner_alive(self) -> bool:
         """Whether a live process works on this run now, as far as can be told from this machine."""
@@ -222,6 +278,18 @@ def owner_alive(lock_file: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(owner, dict) and believed_alive(owner)
+
+
+def _read(path: Path, *, missing: bytes | None = None) -> bytes:
+    """A file's content; `missing`, if given, where there is none. Raises LedgerError if that cannot be had."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        if missing is not None:
+            return missing
+        raise LedgerError(f"{path.parent} is incomplete: it has no {path.name}") from None
+    except OSError as error:
+        raise LedgerError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def find_ledgers(paths: list[Path]) -> list[Ledger]:
@@ -298,6 +366,7 @@ class RunWriter:
         self._lock = Lock(ledger.lock_file)
         self._hashes = {name: hashlib.sha256() for name in ROW_FILES}
         self._sizes = dict.fromkeys(ROW_FILES, 0)
+        self._files: dict[str, list[str]] = {}  # SHA-256 of the whole files that this process wrote
         self._named: dict[str, set[str]] = {}  # the pieces of replay buffers that each checkpoint names
         self.status: Status | None = None
 
@@ -307,6 +376,9 @@ class RunWriter:
             self._lock.acquire()
             try:
                 self.ledger.checkpoints.mkdir(exist_ok=True)
+                for folder in (self.ledger.folder, self.ledger.checkpoints, self.ledger.replay):
+                    for left_behind in folder.glob(_TEMPORARY):  # by a process that was killed while it wrote
+                        left_behind.unlink()
             except BaseException:
                 self._lock.release()
                 raise
@@ -316,32 +388,51 @@ class RunWriter:
         self._lock.release()
 
     def write_config(self, config: str, train: str, test: str) -> None:
-        """Record what was asked for. The config comes last: a folder that has one is complete."""
+        """Record what was asked for. The config comes last: a folder that has one is complete.
+
+        Where there is a status, it names both the old and the new content until the next one is written.
+        """
+        asked = {
+            self.ledger.instances("train"): train.encode(),
+            self.ledger.instances("test"): test.encode(),
+            self.ledger.config: config.encode(),
+        }
         with _clear_errors(self.ledger.folder), self._lock.held():
-            atomic_write(self.ledger.instances("train"), train.encode())
-            atomic_write(self.ledger.instances("test"), test.encode())
-            atomic_write(self.ledger.config, config.encode())
+            hashes = {path.name: hashlib.sha256(content).hexdigest() for path, content in asked.items()}
+            if self.status is not None:
+                before = self.status.files
+                both = {name: sorted({*before.get(name, []), sha256}) for name, sha256 in hashes.items()}
+                self._write_status(dataclasses.replace(self.status, files={**before, **both}))
+            for path, content in asked.items():
+                atomic_write(path, content)
+            self._files |= {name: [sha256] for name, sha256 in hashes.items()}
 
     def restore(self) -> Checkpoint | None:
-        """Cut every row file back to the newest intact checkpoint and return it; to nothing where there is none.
+        """Cut every row file back to the newest intact checkpoint and return it; to nothing where none was written.
 
-        Raises LedgerError if there are checkpoints and rows to build on, but none of them fit together.
+        Raises LedgerError, and changes nothing, if something cannot be read that may be intact, if there are
+        checkpoints but none fits what is there, and if the status names one but there is none.
         """
         files = self.ledger.checkpoint_files()
-        reasons = []
+        named = None if self.status is None else self.status.checkpoint
+        reasons = [f"{named}: missing"] if named is not None and (not files or files[0].name < named) else []
         for file in files:
             try:
-                checkpoint = decode_checkpoint(file.read_bytes())
+                content = self._intact_or_refused(file)
+                checkpoint = decode_checkpoint(content)
                 prefixes = self._verified_prefixes(checkpoint)
-            except (ValueError, OSError) as error:
+            except ValueError as error:
                 reasons.append(f"{file.name}: {error}")
                 continue
+            if reasons:
+                log.warning("going back to the checkpoint of round %d (%s)", checkpoint.round, "; ".join(reasons))
             with _clear_errors(self.ledger.folder), self._lock.held():
+                self._point_at(file.name, content, checkpoint)
                 self._cut(prefixes)
                 for newer in files[: files.index(file)]:
                     newer.unlink()
             return checkpoint
-        if files:
+        if reasons:
             raise LedgerError(
                 f"{self.ledger.folder} cannot be resumed: no checkpoint is intact ({'; '.join(reasons)}). "
                 "Nothing was changed; start the run in another folder"
@@ -350,16 +441,45 @@ class RunWriter:
             self._cut(dict.fromkeys(ROW_FILES, b""))
         return None
 
+    def _intact_or_refused(self, path: Path) -> bytes:
+        """A file's content. Raises ValueError if it is gone, LedgerError if it may be intact but cannot be read now."""
+        try:
+            return path.read_bytes()
+        except FileNotFoundError:
+            raise ValueError(f"{path.name} is missing") from None
+        except OSError as error:
+            raise LedgerError(
+                f"{self.ledger.folder} cannot be resumed now: {path} cannot be read ({error.strerror}). "
+                "Nothing was changed; once the cause is gone, --resume continues"
+            ) from error
+
+    def _point_at(self, name: str, content: bytes, checkpoint: Checkpoint) -> None:
+        """Let the status name the checkpoint that is used, before another one that it may name is removed."""
+        sizes = {file: size for file, (size, _) in checkpoint.data["files"].items()}
+        if self.status is None or (self.status.checkpoint, self.status.committed) == (name, sizes):
+            return
+        self._write_status(
+            dataclasses.replace(
+                self.status, round=checkpoint.round, steps=checkpoint.data.get("about", {}).get("steps", 0),
+                committed=sizes, checkpoint=name, checkpoint_sha256=hashlib.sha256(content).hexdigest(),
+            )
+        )  # fmt: skip
+
     def _verified_prefixes(self, checkpoint: Checkpoint) -> dict[str, bytes]:
+        theirs = checkpoint.data.get("about", {}).get("identity")
+        ours = None if self.status is None else self.status.identity
+        if theirs != ours and None not in (theirs, ours):
+            raise ValueError("it belongs to a run of another configuration")
         for segment in checkpoint.segments:
-            if hashlib.sha256(self._segment_path(segment).read_bytes()).hexdigest() != segment.sha256:
+            content = self._intact_or_refused(self._segment_path(segment))
+            if hashlib.sha256(content).hexdigest() != segment.sha256:
                 raise ValueError(f"{segment.name} has changed since")
         prefixes = {}
         for name, (size, sha256) in checkpoint.data["files"].items():
             if name not in ROW_FILES:
                 raise ValueError(f"it names a file {name!r} that runs do not have")
             path = self.ledger.folder / name
-            content = path.read_bytes()[:size] if path.exists() else b""
+            content = self._intact_or_refused(path)[:size] if size or path.exists() else b""
             if len(content) < size:
                 raise ValueError(f"{name} is shorter than it was")
             if hashlib.sha256(content).hexdigest() != sha256:
@@ -395,7 +515,12 @@ class RunWriter:
                 with (self.ledger.folder / name).open("ab") as file:
                     os.fsync(file.fileno())
             files = {name: (self._sizes[name], self._hashes[name].hexdigest()) for name in ROW_FILES}
-            content = encode_checkpoint(dataclasses.replace(checkpoint, data={**checkpoint.data, "files": files}))
+            about = {
+                "steps": status.steps, "identity": status.identity, "fingerprint": dict(status.fingerprint),
+                "fingerprint_changed": status.fingerprint_changed,
+            }  # fmt: skip
+            data = {**checkpoint.data, "files": files, "about": about}
+            content = encode_checkpoint(dataclasses.replace(checkpoint, data=data))
             path = self.ledger.checkpoints / f"round-{checkpoint.round:09d}.npz"
             atomic_write(path, content)
             self._write_status(
@@ -460,18 +585,25 @@ class RunWriter:
             self._write_status(status)
 
     def _write_status(self, status: Status) -> None:
+        files = {**(self.status.files if self.status else {}), **self._files, **status.files}
+        status = dataclasses.replace(status, files=files)
         data = dataclasses.asdict(status)
         crc = zlib.crc32(json.dumps(data, sort_keys=True).encode())
         atomic_write(self.ledger.status_file, json.dumps({**data, "crc": crc}, indent=1).encode())
         self.status = status
 
     def write_model(self, arrays: Mapping[str, NDArray[Any]], description: Mapping[str, Any]) -> None:
-        """Store the trained policy as `model.npz` and `model.json`."""
+        """Store the trained policy as `model.npz` and `model.json`; the next status names their hashes."""
         buffer = io.BytesIO()
         _savez(buffer, arrays)
+        model = {
+            self.ledger.model_arrays: buffer.getvalue(),
+            self.ledger.model_description: json.dumps(description, indent=1).encode(),
+        }
         with _clear_errors(self.ledger.folder), self._lock.held():
-            atomic_write(self.ledger.model_arrays, buffer.getvalue())
-            atomic_write(self.ledger.model_description, json.dumps(description, indent=1).encode())
+            for path, content in model.items():
+                atomic_write(path, content)
+                self._files[path.name] = [hashlib.sha256(content).hexdigest()]
 
 
 @contextlib.contextmanager
@@ -611,10 +743,9 @@ class Lock:
         with self._locked_file() as file:
             owner = self._read(file)
             if not self._is_mine(owner):
-                raise RunLockedError(
-                    f"{self._path.parent} was taken over by process {owner.get('pid')} on {owner.get('host')}; "
-                    "this process stops and changes nothing more"
-                )
+                who = f"process {owner.get('pid')} on {owner.get('host')}" if owner.get("host") else "somebody else"
+                what = f"taken over by {who}" if owner else f"given up: {self._path.name} was removed or damaged"
+                raise RunLockedError(f"{self._path.parent} was {what}; this process stops and changes nothing more")
             if sign_of_life:  # which costs a write to disk
                 self._write(file)
             yield

@@ -25,8 +25,8 @@ SMALL = [
 pytestmark = pytest.mark.ray
 
 
-def config(workers: int) -> configs.RunConfig:
-    return configs.load(ROOT / "configs/pointmass_space.yaml", [*SMALL, f"resources.workers={workers}"])
+def config(workers: int, *settings: str) -> configs.RunConfig:
+    return configs.load(ROOT / "configs/pointmass_space.yaml", [*SMALL, f"resources.workers={workers}", *settings])
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +96,13 @@ def test_killed_actors_are_replaced_and_change_nothing(
 def test_an_actor_that_cannot_be_placed_is_an_error(cluster_class: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     import ray
 
-    from space_dist import distributed
     from space_dist.errors import SpaceDistError
 
-    run = config(2)
-    monkeypatch.setattr(distributed, "_START_SECONDS", 15.0)
+    run = config(2, "resources.room_seconds=3")
     started = ray.init
     monkeypatch.setattr(ray, "init", lambda **options: started(**{**options, "num_cpus": 1}))
-    with pytest.raises(SpaceDistError, match="2 rollout actors of one CPU each"), cluster_class(run, _setup(run)):
+    said = "2 rollout actors of one CPU each: in 3 s .*the cluster has 1 CPUs"
+    with pytest.raises(SpaceDistError, match=said), cluster_class(run, _setup(run)):
         pass
     assert not ray.is_initialized()
 

@@ -11,7 +11,7 @@ import space_dist
 from space_dist import errors
 
 ROOT = Path(__file__).parent.parent
-HEAVY = ("ray", "torch", "mlflow", "stable_baselines3", "sb3_contrib")
+HEAVY = ("ray", "torch", "mlflow", "stable_baselines3", "sb3_contrib", "pybullet", "pybullet_data")
 
 
 def imported_with(module: str) -> set[str]:

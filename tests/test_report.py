@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -377,6 +378,13 @@ def test_no_runs_and_nowhere_to_write_are_refused(tmp_path: Path) -> None:
 def test_damage_is_named(tmp_path: Path, file: str, content: str, message: str) -> None:
     ledger = start_run(tmp_path / "s0")
     (ledger.folder / file).write_text(content)
+    if file in ledger.status().files:
+        with pytest.raises(LedgerError, match="its checksum is not the one"):
+            load_run(ledger)
+        with RunWriter(ledger) as writer:  # as if the run had been started with it
+            writer.status = ledger.status()
+            sha256 = hashlib.sha256(content.encode()).hexdigest()
+            writer.set_status(dataclasses.replace(writer.status, files={file: [sha256]}))
     with pytest.raises(LedgerError, match=message):
         load_run(ledger)
 

@@ -207,12 +207,16 @@ def test_runs_without_a_uri_are_skipped_and_damaged_ones_named(uri: str, tmp_pat
     bad.config.write_text("[")
     result = sync([bad, none, good])
     assert (result.runs, result.skipped, list(result.failed)) == (1, 1, [bad.folder])
-    assert "not valid YAML" in result.failed[bad.folder]
+    assert "damaged" in result.failed[bad.folder]
 
 
 def test_what_mlflow_refuses_of_one_run_does_not_stop_the_others(uri: str, tmp_path: Path) -> None:
     bad, good = start_run(tmp_path / "a", uri=uri), start_run(tmp_path / "b", seed=1, uri=uri)
-    bad.config.write_text(bad.config.read_text() + "\n'what?': 1\n")
+    with RunWriter(bad) as writer:
+        writer.status = bad.status()
+        train, test = (bad.instances(split).read_text() for split in ("train", "test"))
+        writer.write_config(bad.config.read_text() + "\n'what?': 1\n", train, test)
+        writer.set_status(bad.status())
     result = sync([bad, good])
     assert result.runs == 1
     assert "refuses it" in result.failed[bad.folder]

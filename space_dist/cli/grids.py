@@ -108,34 +108,20 @@ def grid_run(
     ] = None,
 ) -> None:
     """Work through a grid: skip what is done, go on with what is not, retry by cause."""
-    STOP.install()
-    from space_dist.grid import working_on
-    from space_dist.launch import private_ray
-
-    if address == "local":
-        private_ray()
-    from space_dist.ray_jobs import conduct
-
     chosen = _mode(mode)
-    place, manifest = _frozen(grid, _root(root))
+    _prepare(address)
+    place, manifest = frozen(grid, _root(root))
     if digest is not None and digest != manifest.runs_digest:
         raise ConfigError(
             f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
             "export the grid again, and submit that"
         )
-    runs = _part(manifest.runs(), part)
     if stop_file is not None:
         STOP.watch(stop_file, manifest.resources.grace_seconds)
-    _log_to(place)
-    with contextlib.ExitStack() as stack:
-        if part is None:
-            stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
-        observe = stack.enter_context(_display(manifest, place))
-        found = conduct(
-            place, manifest, runs, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes,
-            stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,
-        )  # fmt: skip
-    raise typer.Exit(_tell(manifest, place, found))
+    found = run_frozen(
+        place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part
+    )  # fmt: skip
+    raise typer.Exit(tell(manifest, place, found))
 
 
 @grid_app.command("submit")
@@ -163,7 +149,7 @@ def grid_submit(
     chosen = _mode(mode)
     limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
     base = _root(root)
-    place, manifest = _frozen(grid, base)
+    place, manifest = frozen(grid, base)
     remote = Remote(address, manifest, base)
     job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
     say(f"{manifest.name}: conducted by job {job} at {address}")
@@ -178,7 +164,7 @@ def grid_submit(
             "limited to what the conductor said above"
         )
         raise typer.Exit(code)
-    raise typer.Exit(_tell(manifest, place, found))
+    raise typer.Exit(tell(manifest, place, found))
 
 
 @grid_app.command("status")
@@ -343,7 +329,37 @@ def grid_work(
     raise typer.Exit(75 if ended.cause in resumable else 2 if ended.cause is Cause.CONFIG_ERROR else 1)
 
 
+def run_frozen(
+    place: Grid, manifest: Manifest, *, address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
+    nodes: int = 1, part: str | None = None,
+) -> list[Standing]:  # fmt: skip
+    """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
+    _prepare(address)
+    from space_dist.grid import working_on
+    from space_dist.ray_jobs import conduct
+
+    runs = _part(manifest.runs(), part)
+    _log_to(place)
+    with contextlib.ExitStack() as stack:
+        if part is None:
+            stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
+        observe = stack.enter_context(_display(manifest, place))
+        return conduct(
+            place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
+            stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,
+        )  # fmt: skip
+
+
 # ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def _prepare(address: str) -> None:
+    """What must come before Ray, and anything else that is heavy, is imported."""
+    STOP.install()
+    if address == "local":
+        from space_dist.launch import private_ray
+
+        private_ray()
 
 
 def _root(root: Path | None) -> Path:
@@ -352,7 +368,7 @@ def _root(root: Path | None) -> Path:
     return workplace() / "runs" if root is None else lasting(root, "--root")
 
 
-def _frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
+def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
     """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
     from space_dist.grid import adopt, plan
     from space_dist.manifest import MANIFEST, find_grid
@@ -510,7 +526,7 @@ def _workers_in_words(place: Grid, queue: Queue | None) -> str:
     return "" if place.owner_alive() else "; nobody is working on it now"
 
 
-def _tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
+def tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
     """Say how a grid ended; returns the exit code."""
     from space_dist.standing import exit_code
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Optional
 
 import typer
 from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from space_dist.cli.terminal import Overrides, console, say, write
+from space_dist.cli.terminal import Kwargs, Overrides, console, parse_kwargs, say, write
 from space_dist.errors import ConfigError
 
 instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
@@ -19,16 +19,24 @@ config_app = typer.Typer(no_args_is_help=True, help="Explain and check configs."
 
 @instances_app.command("sample")
 def instances_sample(
-    distribution: Annotated[str, typer.Argument(help="pointmass_uniform, pointmass_target, ...")],
+    distribution: Annotated[
+        str, typer.Argument(help="pointmass_uniform, maze_dfs, ...; uniform: of --env, within its bounds.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for <distribution>_train.csv and <distribution>_test.csv.")],
     n_train: Annotated[int, typer.Option("--train", min=1, max=10_000_000, help="Training instances.")] = 100,
     n_test: Annotated[int, typer.Option("--test", min=1, max=10_000_000, help="Test instances.")] = 100,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    env: Annotated[Optional[str], typer.Option(help="With uniform: the environment.")] = None,  # noqa: UP045
+    kwarg: Kwargs = None,
 ) -> None:
     """Draw disjoint training and test instances."""
-    from space_dist.instances import sample
+    from space_dist.envs import distribution_of
+    from space_dist.instances import DISTRIBUTIONS, sample
 
-    train_set, test_set = sample(distribution, n_train, n_test, seed)
+    if (distribution == "uniform") != (env is not None):
+        raise ConfigError("`instances sample uniform` needs --env, and no other distribution takes it")
+    known = DISTRIBUTIONS if env is None else {"uniform": distribution_of(env, parse_kwargs(kwarg))}
+    train_set, test_set = sample(distribution, n_train, n_test, seed, known)
     for name, chosen in (("train", train_set), ("test", test_set)):
         path = out / f"{distribution}_{name}.csv"
         if path.exists():
@@ -41,12 +49,13 @@ def instances_sample(
 def instances_check(
     files: Annotated[list[Path], typer.Argument(help="CSV files; given two, they must not share a context.")],
     env: Annotated[str, typer.Option(help="The environment whose contexts these are.")] = "space_dist/PointMass-v0",
+    kwarg: Kwargs = None,
 ) -> None:
     """Check instance files and show what is in them."""
     from space_dist.envs import make_batched
     from space_dist.instances import read_csv, refuse_overlap, summary
 
-    bounds = make_batched(env, 1, context_visible=False).context_bounds
+    bounds = make_batched(env, 1, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
     sets = [read_csv(file, bounds) for file in files]
     for index, one in enumerate(sets):
         for other in range(index):

@@ -72,9 +72,9 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
-    from space_dist import config as configs
+    from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
-    from space_dist.launch import policy_of
+    from space_dist.launch import policy_of, stored_config
     from space_dist.ledger import Ledger
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
@@ -82,28 +82,31 @@ def evaluate(
 
     ledger = Ledger(run)
     status = ledger.status()
-    config = configs.load(ledger.config)
+    config = stored_config(ledger)
     policy = policy_of(ledger)
     chosen = read_csv(instances, make_env(config).context_bounds)
     env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     outcome = evaluate_policy(env, policy, chosen.contexts, seeds, gamma=config.learner.gamma)
-    names = ("return", "discounted_return", "length", "success")
-    columns = (outcome.returns, outcome.discounted_returns, outcome.lengths, outcome.success)
-    means = {
-        name: None if np.isnan(values).all() else float(np.mean(values))
-        for name, values in zip(names, columns, strict=True)
-    }
+    columns = {
+        "return": outcome.returns, "discounted_return": outcome.discounted_returns, "length": outcome.lengths,
+        "success": outcome.success,
+    }  # fmt: skip
+    if isinstance(world := unwrapped(env), KnowsOptimum):
+        columns["optimal_return"] = world.optimal_returns(chosen.contexts)
+    means = {name: None if np.isnan(values).all() else float(np.mean(values)) for name, values in columns.items()}
+    if "optimal_return" in columns:  # a share of sums: no single episode's return need be positive
+        means["share_of_optimum"] = float(outcome.returns.sum() / columns["optimal_return"].sum())
     if out is not None:
-        rows = zip(chosen.ids.tolist(), *(values.tolist() for values in columns), strict=True)
-        lines = [f"id,{','.join(names)}", *(",".join(map(str, row)) for row in rows)]
+        rows = zip(chosen.ids.tolist(), *(values.tolist() for values in columns.values()), strict=True)
+        lines = [f"id,{','.join(columns)}", *(",".join(map(str, row)) for row in rows)]
         write(out, "\n".join(lines) + "\n")
     if as_json:
         print(json.dumps({"run": str(run), "steps": status.steps, "state": status.state, "instances": str(instances),
                           "n_instances": len(chosen), **means}))  # fmt: skip
         return
     table = Table(title=f"{config.name}, seed {config.seed}, after {status.steps:,} steps ({status.state})")
-    for name in ("instances", *names):
+    for name in ("instances", *means):
         table.add_column(name.replace("_", " "), justify="right")
     shown = ["—" if value is None else f"{value:.3f}" for value in means.values()]
     table.add_row(str(len(chosen)), *shown)

@@ -16,7 +16,7 @@ from space_dist.interrupts import StopRequests
 STOP = StopRequests()
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Any, Optional
 
 import typer
 from rich.console import Console
@@ -30,6 +30,11 @@ Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders,
 Overrides = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
     typer.Option("--set", metavar="KEY=VALUE", help="Override a config key, e.g. budget.steps=20000. Repeatable."),
+]
+
+Kwargs = Annotated[
+    Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
+    typer.Option("--kwarg", metavar="NAME=VALUE", help="An argument of the environment (env.kwargs). Repeatable."),
 ]
 
 
@@ -50,3 +55,22 @@ def write(path: Path, text: str) -> None:
         path.write_text(text)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+
+
+def parse_kwargs(given: list[str] | None) -> dict[str, Any]:
+    """`NAME=VALUE` as YAML reads the value. Raises ConfigError for anything else."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    kwargs: dict[str, Any] = {}
+    for one in given or []:
+        name, equals, value = one.partition("=")
+        if not equals or not name.isidentifier():
+            raise ConfigError(f"--kwarg {one!r} is not NAME=VALUE")
+        try:
+            kwargs[name] = YAML(typ="safe", pure=True).load(value)
+        except YAMLError:
+            kwargs[name] = None
+        if not isinstance(kwargs[name], bool | int | float | str):
+            raise ConfigError(f"--kwarg {one!r}: the value must be a number, a word, true or false")
+    return kwargs

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
+import warnings
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
+from space_dist.envs.antgoal import BatchedAntGoal
+from space_dist.envs.ballcatching import BatchedBallCatching
+from space_dist.envs.carl import CarlEnv, is_carl
 from space_dist.envs.cartpole import BatchedCartPole
-from space_dist.envs.interface import BatchedEnv, ContextVisible, Step
+from space_dist.envs.interface import BatchedEnv, ContextVisible, Drawable, DrawsContexts, KnowsOptimum, Step
+from space_dist.envs.maze import BatchedMaze
 from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
+from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError, nearest
-from space_dist.instances import ContextBounds
+from space_dist.instances import ContextBounds, Distribution
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
     "space_dist/CartPole-v0": BatchedCartPole,
+    "space_dist/AntGoal-v0": BatchedAntGoal,
+    "space_dist/BallCatching-v0": BatchedBallCatching,
+    "space_dist/Maze-v0": BatchedMaze,
 }
 
 
@@ -39,19 +50,107 @@ def make_batched(
 ) -> BatchedEnv:
     """Build a batched environment by registered id or by import path (`my_package.my_module:make`).
 
-    A function at an import path is called with the number of slots, and `kwargs`, and returns a `BatchedEnv`.
+    A function at an import path that takes a number of slots (a parameter `n_slots`, or one without a default that
+    `kwargs` does not give) is called with it and `kwargs`, and returns a `BatchedEnv`. Any other is called with
+    `kwargs` alone and returns a `gymnasium.Env`, of which `BatchedSingles` makes a batch; `horizon` in `kwargs` is
+    then for that, unless the function has a parameter of this name. Classes of CARL's are wrapped in `CarlEnv`.
+
     Raises ConfigError if there is no such environment, or none with such arguments.
     """
     make = _find(env_id)
-    if kwargs:
-        try:
-            inspect.signature(make).bind(n_slots, **kwargs)
-        except TypeError as error:
-            raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
     try:
-        env: BatchedEnv = make(n_slots, **kwargs)
+        if _takes_slots(make, kwargs):
+            _refuse_arguments(env_id, make, (n_slots,), kwargs)
+            env = make(n_slots, **kwargs)
+        else:
+            own = dict(kwargs)
+            horizon = None if takes_argument(env_id, "horizon") else own.pop("horizon", None)
+            _refuse_arguments(env_id, make, (), own)
+            env = make(**own)
+            if isinstance(env, gym.Env):
+                # The first is here already; the others must be its equals and not itself.
+                ready = [env]
+                env = BatchedSingles(n_slots, lambda: ready.pop() if ready else make(**own), horizon)
+    except ConfigError as error:
+        raise ConfigError(f"env.id {env_id!r}: {error}") from None
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
         raise ConfigError(f"env.id {env_id!r} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
+    _refuse_interface(env_id, env)
+    batched: BatchedEnv = env
+    return ContextVisible(batched) if context_visible else batched
+
+
+def unwrapped(env: BatchedEnv) -> BatchedEnv:
+    """The environment itself, without what makes its context visible."""
+    return env.unwrapped if isinstance(env, ContextVisible) else env
+
+
+def takes_argument(env_id: str, name: str) -> bool:
+    """Whether the function or class behind an id has a parameter of this name."""
+    try:
+        return name in inspect.signature(_find(env_id)).parameters
+    except (TypeError, ValueError):  # written in C
+        return False
+
+
+def distribution_of(env_id: str, kwargs: Mapping[str, Any] = MappingProxyType({})) -> Distribution:
+    """What an environment's contexts are drawn from where nothing else is known: uniform within the bounds.
+
+    The environment's own, if it draws its contexts. Whole numbers, if its contexts are such.
+    """
+    env = make_batched(env_id, 1, context_visible=False, kwargs=kwargs)
+    bounds = env.context_bounds
+    if isinstance(env, DrawsContexts):
+        return Distribution(f"{env_id}, its own", "the environment", bounds, env.draw_contexts)
+    if isinstance(env, BatchedSingles) and env.whole_contexts:
+        return Distribution(
+            f"{env_id}, whole numbers, uniform within the bounds", "the environment (the bounds)", bounds,
+            lambda rng, n: rng.integers(
+                np.ceil(bounds.low).astype(int), np.floor(bounds.high).astype(int), size=(n, len(bounds.low)),
+                endpoint=True,
+            ).astype(np.float64),
+        )  # fmt: skip
+    return Distribution(
+        f"{env_id}, uniform within the bounds", "the environment (the bounds)", bounds,
+        lambda rng, n: rng.uniform(bounds.low, bounds.high, size=(n, len(bounds.low))),
+    )  # fmt: skip
+
+
+def _takes_slots(make: Callable[..., Any], kwargs: Mapping[str, Any]) -> bool:
+    try:
+        parameters = inspect.signature(make).parameters
+    except (TypeError, ValueError):  # written in C
+        return True
+    return "n_slots" in parameters or any(
+        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        and parameter.default is parameter.empty
+        and name not in kwargs
+        for name, parameter in parameters.items()
+    )
+
+
+def _refuse_arguments(
+    env_id: str, make: Callable[..., Any], positional: tuple[int, ...], kwargs: Mapping[str, Any]
+) -> None:
+    if not kwargs:
+        return
+    try:
+        inspect.signature(make).bind(*positional, **kwargs)
+    except TypeError as error:
+        raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
+
+
+def _refuse_interface(env_id: str, env: Any) -> None:
+    if isinstance(env, gym.Env):
+        raise ConfigError(
+            f"env.id {env_id!r} was called with a number of slots and returned one gymnasium.Env; the function of a "
+            "single environment needs no argument but those in env.kwargs"
+        )
+    if isinstance(env, gym.vector.VectorEnv):
+        raise ConfigError(
+            f"env.id {env_id!r} made a Gymnasium vector environment, which resets by itself and so with no context; "
+            "return a single gymnasium.Env instead"
+        )
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
                if not hasattr(env, name)]  # fmt: skip
     if missing:
@@ -66,37 +165,51 @@ def make_batched(
         value: Any = getattr(env, name)
         if not isinstance(value, kind) or (name == "horizon" and env.horizon < 1):
             raise ConfigError(f"env.id {env_id!r}: its {name} must be {what}, not {str(value)[:80]!r}")
-    return ContextVisible(env) if context_visible else env
 
 
-def _find(env_id: str) -> Callable[[int], Any]:
+def _find(env_id: str) -> Callable[..., Any]:
     if env_id in BATCHED:
         return BATCHED[env_id]
+    if env_id in gym.registry:  # somebody else's: made as Gymnasium makes it, TimeLimit included
+        return lambda **kwargs: gym.make(env_id, disable_env_checker=True, **kwargs)
     module_name, colon, name = env_id.partition(":")
     if not colon:
         raise ConfigError(
             f"env.id {env_id!r} is not known{nearest(env_id, BATCHED)} Known: {', '.join(BATCHED)}, "
-            "or an import path like my_package.my_module:make"
+            "an id registered with Gymnasium, or an import path like my_package.my_module:make"
         )
     try:
-        found = getattr(importlib.import_module(module_name), name, None)
+        with warnings.catch_warnings():
+            if module_name.partition(".")[0] == "carl":  # warns of each of its suites that is not installed
+                warnings.simplefilter("ignore")
+            found = getattr(importlib.import_module(module_name), name, None)
     except (Exception, SystemExit) as error:  # somebody else's module may raise anything
         what = f"{type(error).__name__}: {str(error)[:200]}"
         raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {what}") from error
     if not callable(found):
         raise ConfigError(f"env.id {env_id!r}: {module_name!r} has no function {name!r}")
-    made: Callable[[int], Any] = found
+    made: Callable[..., Any] = functools.partial(CarlEnv, found) if is_carl(found) else found
     return made
 
 
 __all__ = [
+    "BatchedAntGoal",
+    "BatchedBallCatching",
     "BatchedCartPole",
     "BatchedEnv",
+    "BatchedMaze",
     "BatchedPointMass",
+    "BatchedSingles",
     "ContextObservation",
     "ContextVisible",
+    "Drawable",
+    "DrawsContexts",
+    "KnowsOptimum",
     "Observations",
     "SingleEnv",
     "Step",
+    "distribution_of",
     "make_batched",
+    "takes_argument",
+    "unwrapped",
 ]

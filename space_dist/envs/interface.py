@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces
@@ -67,7 +67,39 @@ class BatchedEnv(Protocol):
         """Step every slot. actions: (n_slots, *action_shape). A slot whose episode has ended must be reset first."""
 
 
+@runtime_checkable
+class Closable(Protocol):
+    """A batched environment that holds more than memory of Python's."""
+
+    def close(self) -> None:
+        """Free it. May be called twice; `reset` afterwards takes it anew."""
+
+
 MakeBatched = Callable[[int], BatchedEnv]
+
+
+@runtime_checkable
+class DrawsContexts(Protocol):
+    """A batched environment whose contexts are not just any numbers within their bounds."""
+
+    def draw_contexts(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """`(n, d)` contexts for whoever gives none."""
+
+
+@runtime_checkable
+class KnowsOptimum(Protocol):
+    """A batched environment that knows what a perfect policy would earn."""
+
+    def optimal_returns(self, contexts: FloatArray) -> FloatArray:
+        """`(n, d) -> (n,)` the highest undiscounted return of an episode in each context."""
+
+
+@runtime_checkable
+class Drawable(Protocol):
+    """A batched environment that can draw itself, for `space-dist render`."""
+
+    def frame(self, slot: int) -> NDArray[np.uint8]:
+        """`(height, width, 3)`: what a slot's episode looks like now. Drawing must not change the episode."""
 
 
 class ContextVisible:
@@ -77,7 +109,7 @@ class ContextVisible:
     """
 
     def __init__(self, env: BatchedEnv) -> None:
-        self._env = env
+        self.unwrapped = self._env = env
         self.n_slots, self.horizon = env.n_slots, env.horizon
         self.action_space, self.context_bounds = env.action_space, env.context_bounds
         inner, n_features = env.observation_space, len(env.context_bounds.names)
@@ -111,4 +143,4 @@ class ContextVisible:
             return {**observations, "context": context}
         if isinstance(self.observation_space, spaces.Dict):
             return {"observation": observations, "context": context}
-        return np.concatenate([observations, context], axis=1)
+        return np.concatenate([observations.astype(np.float32, copy=False), context], axis=1)

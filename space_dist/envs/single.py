@@ -9,15 +9,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.interface import MakeBatched
+from space_dist.envs.interface import Closable, DrawsContexts, MakeBatched
 from space_dist.envs.observations import each
 
 
 class SingleEnv(gym.Env[Any, Any]):
     """Contexts come with `reset(options={"context": array})` and stay until another one is given.
 
-    Without any, the context is drawn uniformly from `context_space` at each reset. The first call of `reset` without a
-    seed takes one from the operating system, as Gymnasium prescribes.
+    Without any, one is drawn at each reset: by the environment, or uniformly from `context_space`. The first call of
+    `reset` without a seed takes one from the operating system, as Gymnasium prescribes.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
@@ -61,7 +61,14 @@ class SingleEnv(gym.Env[Any, Any]):
             info,
         )
 
+    def close(self) -> None:
+        """Free what the environment holds outside Python, if anything."""
+        if isinstance(self._env, Closable):
+            self._env.close()
+
     def _draw_context(self) -> NDArray[np.float64]:
+        if isinstance(self._env, DrawsContexts):
+            return _first(self._env.draw_contexts(self.np_random, 1))
         bounds = self._env.context_bounds
         return self.np_random.uniform(bounds.low, bounds.high)
 
@@ -103,4 +110,4 @@ class ContextObservation(
 
     def observation(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """`(obs_dim + d,)`."""
-        return np.concatenate([observation, self._scaled])
+        return np.concatenate([observation.astype(np.float32, copy=False), self._scaled])

@@ -127,14 +127,10 @@ class Configuration:
 def read_config(ledger: Ledger) -> dict[str, Any]:
     """A run's resolved config as plain data, so that runs of any version of the schema can be read.
 
-    Raises LedgerError if it is missing or not a YAML mapping.
+    Raises LedgerError if it is missing, damaged, or not a YAML mapping.
     """
     try:
-        data = YAML(typ="safe", pure=True).load(ledger.config.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise LedgerError(f"{ledger.folder} is incomplete: it has no config.yaml") from None
-    except OSError as error:
-        raise LedgerError(f"{ledger.config} cannot be read: {error.strerror}") from None
+        data = YAML(typ="safe", pure=True).load(ledger.read(ledger.config).decode())
     except (YAMLError, ValueError, RecursionError):
         raise LedgerError(f"{ledger.config} is damaged: it is not valid YAML") from None
     if not isinstance(data, dict):
@@ -240,10 +236,8 @@ def _identity(run: Run) -> str:
 def _read_instances(ledger: Ledger, split: Split) -> str:
     path = ledger.instances(split)
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise LedgerError(f"{ledger.folder} is incomplete: it has no {path.name}") from None
-    except (OSError, UnicodeDecodeError):
+        return ledger.read(path).decode()
+    except UnicodeDecodeError:
         raise LedgerError(f"{path} cannot be read") from None
 
 

@@ -256,7 +256,8 @@ class GridMirror:
         tags = {key: value[:MAX_TAG] for key, value in tags.items()}
         stamp = key_of(repr(sorted(tags.items())), repr(look.status), look.ending)
         return Part(
-            key_of(grid_key, cell.id, str(run.seed)), run.title, _remark(look), tags, look.ending, look.ended_at, stamp
+            key_of(grid_key, cell.id, str(run.seed)), run.title, _remark(look), tags, look.ending, look.ended_at, stamp,
+            shows_episodes=run.seed == manifest.seeds[0],
         )  # fmt: skip
 
     def _parent(self, manifest: Manifest, key: str) -> Parent:

@@ -14,6 +14,8 @@ import logging
 import os
 import re
 import sqlite3
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric
     from mlflow.entities import Run as MlflowRun
+
+    from space_dist.report.load import Run as LoadedRun
 
 log = logging.getLogger("space_dist.tracking")
 
@@ -44,6 +48,7 @@ _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; ml
 _MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
+_DRAW_SECONDS: Final = 60.0  # for the pictures of a run
 _ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
 # MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
 _ENVIRONMENT: Final = {
@@ -69,6 +74,7 @@ class Part:
     key: `(32 hex digits)` of grid, cell and seed. title: the child's name. remark: the end of its description.
     tags: more of them, the parent's id among them. ending: how it stands in MLflow's words. ended_at: seconds since
     the epoch. stamp: changes whenever anything that is pushed does; a child that has it is up to date.
+    shows_episodes: whether its policy is drawn when it is done: drawing takes seconds, so one seed of a cell is enough.
     """
 
     key: str
@@ -78,6 +84,7 @@ class Part:
     ending: str
     ended_at: float
     stamp: str
+    shows_episodes: bool
 
 
 @dataclass(frozen=True)
@@ -450,9 +457,11 @@ class Store:
             if missing := [file.name for file in files if not file.exists()]:
                 raise LedgerError(f"{ledger.folder} is done but has no {', '.join(missing)}")
             with tempfile.TemporaryDirectory() as folder:
-                for figure in _draw(ledger, Path(folder)):
+                episodes = snapshot.part is None or snapshot.part.shows_episodes
+                for figure in _draw(ledger, Path(folder), episodes=episodes):
                     self._client.log_artifact(run.info.run_id, str(figure), "figures")
         for file in files:
+            ledger.read(file)  # is it what the run wrote?
             self._client.log_artifact(run.info.run_id, str(file))
         self._client.set_tag(run.info.run_id, ARTIFACTS_TAG, wanted)
 
@@ -474,8 +483,8 @@ class Store:
             self._client.set_terminated(run.info.run_id, wanted, end_time=end)
 
 
-def _draw(ledger: Ledger, folder: Path) -> list[Path]:
-    """PNGs of a finished run in `folder`."""
+def _draw(ledger: Ledger, folder: Path, *, episodes: bool) -> list[Path]:
+    """Figures of a finished run in `folder`; with `episodes`, what its policy does, too."""
     from space_dist.report import draw_curriculum, draw_learning_curve, load_run, save
 
     run = load_run(ledger)
@@ -486,7 +495,31 @@ def _draw(ledger: Ledger, folder: Path) -> list[Path]:
         figures["curriculum.png"] = draw_curriculum(run)
     for name, figure in figures.items():
         save(figure, folder / name)
-    return [folder / name for name in figures]
+    return [folder / name for name in figures] + (_draw_episodes(run, folder / "episodes") if episodes else [])
+
+
+def _draw_episodes(run: LoadedRun, folder: Path) -> list[Path]:
+    """What the policy does, in GIFs and PNGs, for our own environments and policies that act without torch.
+
+    In a process of its own, which can be ended when it takes too long; a failure costs a warning.
+    """
+    ledger = run.ledger
+    try:
+        env_id = str(run.config["env"]["id"])
+        policy = json.loads(ledger.model_description.read_bytes())["policy"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []  # nothing that acts
+    if policy == "torch" or not env_id.startswith("space_dist/"):
+        return []
+    command = [sys.executable, "-m", "space_dist.cli", "render", "--out", str(folder), "--", str(ledger.folder)]
+    try:
+        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_DRAW_SECONDS, check=True)
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip()
+        log.warning("%s: its episodes were not drawn: %s", ledger.folder, said[:300])
+    except (subprocess.TimeoutExpired, OSError) as error:
+        log.warning("%s: its episodes were not drawn: %s", ledger.folder, error)
+    return sorted([*folder.glob("*.gif"), *folder.glob("*.png")])  # whole ones, also of a process that was ended
 
 
 def _whole_number(text: str) -> int:

@@ -1,0 +1,81 @@
+"""Maze (gym-maze, 5x5): find the way from the top left to the bottom right; the layout is the context.
+
+Facts: ../shared/reference/algorithm.md ("Maze 5x5").
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from space_dist.envs.interface import FloatArray, IntArray, Step
+from space_dist.instances import MAZE_BOUNDS
+from space_dist.mazes import CELLS, GOAL, SIDE, START, carve, shortest_ways, successors
+
+GOAL_REWARD = 1.0
+STEP_REWARD = -0.1 / CELLS  # of every step but the one onto the goal
+HORIZON = 200  # gym-maze registers 2,000: ours is shorter
+
+
+class BatchedMaze:
+    """`n_slots` mazes. Context: the 25 numbers of a layout (see `space_dist.mazes`); the whole maze, not a view.
+
+    Observed are the integers (x, y); (0, 0) is the start. Actions: 0 north (y - 1), 1 south, 2 east, 3 west; a blocked
+    move stays. The step onto the goal (4, 4) pays 1 and ends the episode, every other one costs 0.004. Nothing is
+    random: seeds are accepted and decide nothing.
+    """
+
+    def __init__(self, n_slots: int, *, horizon: int = HORIZON) -> None:
+        self.n_slots, self.horizon = n_slots, horizon
+        self.observation_space = spaces.Box(0, SIDE - 1, shape=(2,), dtype=np.int64)
+        self.action_space = spaces.Discrete(4)
+        self.context_bounds = MAZE_BOUNDS
+        self._next = np.zeros((n_slots, CELLS, 4), dtype=np.int64)
+        self._slots = np.arange(n_slots)
+        self._cell = np.full(n_slots, START)
+        self._time = np.zeros(n_slots, dtype=np.int64)
+
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> NDArray[np.int64]:  # noqa: ARG002
+        """Start new episodes at (0, 0). Raises ValueError for a layout of anything but whole numbers."""
+        if (contexts != np.floor(contexts)).any():
+            raise ValueError("a maze's layout is 25 whole numbers from 0 to 15")
+        self._next[slots] = successors(contexts)
+        self._cell[slots], self._time[slots] = START, 0
+        return self._observe(self._cell[slots])
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        """One move. Raises ValueError unless every action is 0, 1, 2 or 3."""
+        moves = actions.astype(np.int64)
+        if ((moves != actions) | (moves < 0) | (moves > 3)).any():
+            raise ValueError(f"actions must be 0, 1, 2 or 3, not {np.array2string(actions, threshold=10)}")
+        self._cell = self._next[self._slots, self._cell, moves]
+        self._time += 1
+        arrived = self._cell == GOAL
+        return Step(
+            observations=self._observe(self._cell),
+            rewards=np.where(arrived, GOAL_REWARD, STEP_REWARD),
+            terminated=arrived,
+            truncated=(self._time >= self.horizon) & ~arrived,
+            success=arrived.copy(),
+        )
+
+    def draw_contexts(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """`(n, 25)` perfect mazes: few layouts within the bounds are mazes with a way through."""
+        return carve(rng, n)
+
+    def optimal_returns(self, contexts: FloatArray) -> FloatArray:
+        """`(n, 25) -> (n,)` undiscounted returns of the shortest ways: 1 - 0.004 (L - 1) for L moves.
+
+        Where no way is short enough for the horizon, standing still is as good as anything.
+        """
+        moves = shortest_ways(contexts)
+        inside = moves <= self.horizon
+        best: FloatArray = np.where(
+            inside, GOAL_REWARD + STEP_REWARD * (np.where(inside, moves, 1) - 1), STEP_REWARD * self.horizon
+        )
+        return best
+
+    @staticmethod
+    def _observe(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.stack([cells % SIDE, cells // SIDE], axis=1)

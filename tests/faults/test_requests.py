@@ -1,0 +1,123 @@
+"""Requests to stop are heard at any time, and answered with 75."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from space_dist import config as configs
+from space_dist.interrupts import STOP_SIGNALS, StopRequests
+from space_dist.launch import launch
+from space_dist.ledger import Ledger
+from tests.faults.test_every_write import short
+from tests.test_learners import results
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+WHAT_IS_IMPORTED = """
+import sys
+from space_dist.interrupts import StopRequests
+def install(self):
+    print(*sorted({name.partition(".")[0] for name in sys.modules}))
+    raise SystemExit(0)
+StopRequests.install = install
+from space_dist.cli import main
+sys.argv = ["space-dist", "train", "config.yaml"]
+main()
+"""
+
+
+def test_handlers_stand_before_anything_heavy_is_imported() -> None:
+    done = subprocess.run([sys.executable, "-c", WHAT_IS_IMPORTED], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    imported = set(done.stdout.split())
+    assert {"space_dist", "typer"} <= imported
+    assert not imported & {"numpy", "torch", "ray", "mlflow", "gymnasium", "scipy", "stable_baselines3"}
+
+
+def test_handlers_stand_while_something_would_replace_them() -> None:
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    stop = StopRequests()
+    try:
+        with stop.standing():  # none were set
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+        stop.install()
+        ours = signal.getsignal(signal.SIGTERM)
+        with stop.standing():
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            assert signal.getsignal(signal.SIGTERM) == ours
+            signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # none of ours
+        assert signal.getsignal(signal.SIGUSR2) == signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTERM) == ours
+    finally:
+        signal.signal(signal.SIGUSR2, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def command(tmp_path: Path, *settings: str, env: str | None = None) -> list[str]:
+    config = short(tmp_path, "ppo", 4)
+    if env is not None:
+        config = config.model_copy(update={"env": config.env.model_copy(update={"id": env})})
+    (tmp_path / "config.yaml").write_text(configs.dump(config))
+    made = [sys.executable, "-m", "space_dist.cli", "train", str(tmp_path / "config.yaml"), "--resume"]
+    made += ["--out", str(tmp_path / "run")]
+    for setting in settings:
+        made += ["--set", setting]
+    return made
+
+
+def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(tmp_path: Path) -> None:
+    slow = command(
+        tmp_path, "env.kwargs={seconds: 0.3}", "resources.grace_seconds=0.3", "evaluation.every_steps=100000",
+        env="tests.faults.slow_env:make",
+    )  # fmt: skip
+    process = subprocess.Popen(slow, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 100
+        while not list((tmp_path / "run" / "checkpoints").glob("round-*2.npz")) and time.monotonic() < deadline:
+            time.sleep(0.01)
+            assert process.poll() is None
+        process.send_signal(signal.SIGUSR1)
+        _, said = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 75, said
+    assert "Traceback" not in said
+    status = Ledger(tmp_path / "run").status()
+    assert status.checkpoint == "round-000000002.npz"
+    config = configs.load(tmp_path / "config.yaml", ["env.kwargs={seconds: 0.3}", "evaluation.every_steps=100000"])
+    launch(config, tmp_path / "run", resume=True, stop=StopRequests())
+    launch(config, tmp_path / "reference", resume=True, stop=StopRequests())
+    assert results(tmp_path / "run") == results(tmp_path / "reference")
+
+
+@pytest.mark.ray
+@pytest.mark.parametrize("progress", [0.0, 0.5, 1.0])
+def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float) -> None:
+    process = subprocess.Popen(
+        command(tmp_path, "resources.workers=1", "budget.steps=320000", "resources.grace_seconds=100"),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        log, deadline = tmp_path / "run" / "log.txt", time.monotonic() + 100
+        while not log.exists() and time.monotonic() < deadline:  # what is written just before Ray is started
+            time.sleep(0.01)
+        time.sleep(4.0 * progress)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 75, said
+    assert "stopped by SIGTERM" in said
+    assert Ledger(tmp_path / "run").status().state == "interrupted"
+    assert os.environ.get("RAY_ADDRESS") is None

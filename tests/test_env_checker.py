@@ -1,0 +1,141 @@
+"""Every fault is found, and said in the right words; what is without fault passes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from space_dist import cli
+from space_dist.envs import BATCHED, make_batched
+from space_dist.envs.checker import check
+from space_dist.errors import ConfigError
+from space_dist.instances import InstanceSet
+
+FAULTS = {
+    "IgnoresContexts": "contexts are ignored: another context changes nothing",
+    "UnseededStart": "the start state is not seeded",
+    "UnseededStep": "unseeded randomness in step(): with the same seed, context and actions, two episodes differ from "
+    "step 1 on",
+    "Remembers": "depends on earlier episodes: played again after others, .* it differs from step 1 on",
+    "KeepsFirstContext": "a context does not arrive: only that of the very first reset counts",
+    "Forgets": "the context does not survive: after a reset without options",
+    "NeedsOne": "before any context was given (there must be a default one) fails: AssertionError",
+    "SharesItsState": "depends on the neighbours in the batch",
+    "UsesGlobalGenerator": "depends on the neighbours in the batch",
+    "WrongShape": "spaces are wrong: the observation at reset has shape (2,), its space says (1,)",
+    "WrongDtype": "spaces are wrong: the observation at reset is of dtype float64, its space says float32",
+    "NoArray": "the observation at reset is a list, not an array",
+    "Outside": "spaces are wrong: the observation at step 5 holds 2 at [0], outside its space's bounds [-1, 1]",
+    "NaNs": "the observation at step 4 holds NaN",
+    "InfiniteReward": "a reward at step 1 is inf",
+    "TellsNowAndThen": "at the end of some episodes and not of others",
+    "NoOptions": "it takes no `seed` or no `options`",
+    "NoInfo": "reset() must return (observation, info)",
+    "OldStep": "step() must return (observation, reward, terminated, truncated, info)",
+    "FailsAtTheEdge": "reset() with the context gain .* fails: KeyError: 'no such gain'",
+    "FailsInStep": "step() fails: ZeroDivisionError",
+    "ChangesActions": "step() changes the action it is given",
+    "NumberObserved": "its observation_space must be a Box or a Dict of Boxes, not Discrete(5)",
+    "OnePartOnly": "the observation at reset has the parts place, its space has clock, place",
+    "NoContextSpace": "has no `context_space`",
+    "EndlessBounds": "its context_space cannot be used: feature 'gain' has bounds [-inf, inf]",
+    "NamesTwice": "the feature 'gain' is named twice",
+    "NoLength": "the length of its episodes is unknown",
+    "the_same_one": "returned the same environment twice",
+    "make": "called with a number of slots and returned one gymnasium.Env",
+}
+BATCHED_FAULTS = {
+    "Endless": "episodes do not end: after its horizon of 8 steps",
+    "Neighbourly": "depends on the neighbours in the batch",
+    "SlotMatters": "depends on the neighbours in the batch",
+    "ChangesContexts": "reset() changes the contexts it is given",
+    "ChangesBatchedActions": "step() changes the actions it is given",
+    "OneReward": "rewards at step 1 have shape (1,), not one number for each slot",
+    "NumbersForEnds": "terminated at step 1 is of dtype float64, not bool",
+    "Counts": "unseeded randomness in step()",
+}
+
+
+def said(fault: str, words: str) -> bool:
+    """Whether all parts of `words`, which ` .* ` separates, stand in `fault` in this order."""
+    at = 0
+    for part in words.split(" .* "):
+        at = fault.find(part, at)
+        if at < 0:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_single_environments_fault_is_named(kind: str) -> None:
+    (fault,) = check(f"tests.faulty_env:{kind}").faults
+    assert said(fault, FAULTS[kind]), fault
+
+
+@pytest.mark.parametrize("kind", BATCHED_FAULTS)
+def test_a_batched_environments_fault_is_named(kind: str) -> None:
+    (fault,) = check("tests.faulty_env:batched", {"kind": kind}).faults
+    assert said(fault, BATCHED_FAULTS[kind]), fault
+
+
+@pytest.mark.parametrize("kind", ["Honest", "Whole", "Parts", "HalfUsed"])
+def test_without_fault(kind: str) -> None:
+    findings = check(f"tests.faulty_env:{kind}")
+    assert findings.faults == []
+    assert findings.horizon == 12
+    notes = [note for note in findings.notes if "'drift'" in note]
+    assert len(notes) == (kind == "HalfUsed")
+
+
+@pytest.mark.parametrize("env_id", BATCHED)
+def test_our_own_environments_pass(env_id: str) -> None:
+    assert check(env_id).faults == []
+
+
+@pytest.mark.parametrize("make", ["make", "make_discrete", "make_image", "make_dict", "make_scaled"])
+def test_the_tests_own_environments_pass(make: str) -> None:
+    assert check(f"tests.tiny_env:{make}").faults == []
+
+
+def test_contexts_can_be_given() -> None:
+    bounds = make_batched("tests.faulty_env:FailsAtTheEdge", 1, context_visible=False).context_bounds
+    inside = InstanceSet(np.arange(2), np.array([[0.2, 0.1], [0.3, 0.0]]), bounds.names)
+    faults = check("tests.faulty_env:FailsAtTheEdge", instances=inside).faults
+    assert faults == []
+    with pytest.raises(ConfigError, match="at least two"):
+        check("tests.faulty_env:Honest", instances=inside.subset([0]))
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["space-dist", "env", "check", *arguments])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    try:
+        cli.main()
+    except SystemExit as error:
+        return int(error.code or 0)
+    return 0
+
+
+def test_the_command_says_it_and_exits_with_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert command(monkeypatch, "tests.faulty_env:IgnoresContexts") == 2
+    assert "tests.faulty_env:IgnoresContexts: contexts are ignored" in capsys.readouterr().err
+    assert command(monkeypatch, "CartPole-v1") == 2
+    error = capsys.readouterr().err
+    assert error.count("CartPole-v1") == 1
+    assert "has no `context_space`" in error
+    assert command(monkeypatch, "tests.faulty_env:HalfUsed") == 0
+    out = capsys.readouterr().out
+    assert "note: changing 'drift' alone" in out
+    assert "no fault found. Context: gain, drift. Horizon: 12 steps" in out
+    assert command(monkeypatch, "tests.faulty_env:batched", "--kwarg", "kind=Endless") == 2
+    assert "do not end" in capsys.readouterr().err
+    assert command(monkeypatch, "tests.faulty_env:batched", "--kwarg", "kind") == 2
+    assert "is not NAME=VALUE" in capsys.readouterr().err
+    file = tmp_path / "contexts.csv"
+    file.write_text("id,gain,drift\n0,0.2,0\n1,0.3,0.1\n")
+    assert command(monkeypatch, "tests.faulty_env:FailsAtTheEdge", "--instances", str(file)) == 0
