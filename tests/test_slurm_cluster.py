@@ -22,7 +22,8 @@ import pytest
 from space_dist.config import to_yaml
 from space_dist.ledger import METRICS, Ledger
 from space_dist.manifest import Grid
-from space_dist.slurm.export import JOBS
+from space_dist.slurm import Export, Profile
+from space_dist.slurm.export import AGGREGATE, JOBS, render
 from tests.slurm.gated_env import GATE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -271,10 +272,11 @@ def test_one_ray_over_two_nodes_survives_the_loss_of_one(slurm: Slurm, reference
 
 
 def test_sbatch_reads_hostile_values_as_text(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
-    for number, value in enumerate((r'a "b" \c # d', "$(touch canary) `touch canary`", "it's; touch canary #", "#x")):
-        folder = export(reference.folder, tmp_path / str(number), tmp_path / "no_gate", comment=value)
+    for value in ('a "b" \\c # d', "$(touch canary) `touch canary`", "it's; touch canary #", "#x"):
+        made = Export(reference.manifest(), Profile(comment=value), "array")
+        (tmp_path / AGGREGATE).write_text(render(made)[AGGREGATE])
         held = subprocess.run(
-            ["sbatch", "--parsable", "--hold", "aggregate.sbatch"], cwd=folder, env=slurm.environment, text=True,
+            ["sbatch", "--parsable", "--hold", AGGREGATE], cwd=tmp_path, env=slurm.environment, text=True,
             capture_output=True, check=True, timeout=60,
         )  # fmt: skip
         job = held.stdout.strip()
