@@ -78,9 +78,14 @@ def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
     installed = subprocess.run([HERE / "install.sh"], capture_output=True, text=True, timeout=300)
     if installed.returncode:
         pytest.skip(f"Slurm cannot be installed here: {installed.stderr.strip().splitlines()[-1]}")
-    spaces = ["unshare", "--pid", "--fork", "--mount", "--net", "--uts", "--ipc", "true"]
-    if subprocess.run(spaces, capture_output=True).returncode:
-        pytest.skip("Slurm's two nodes need namespaces of their own, which this machine refuses (unshare)")
+    probe = (
+        "unshare --pid --fork --mount --net --uts --ipc true && ip link add spprobe type bridge && ip link del spprobe"
+    )
+    refused = subprocess.run(["bash", "-c", f"PATH=$PATH:/sbin:/usr/sbin; {probe}"], capture_output=True, text=True)
+    if refused.returncode:
+        pytest.skip(
+            f"Slurm's two nodes need namespaces and a bridge, which this machine refuses: {refused.stderr.strip()}"
+        )
     found = Slurm(tmp_path_factory.mktemp("slurm"))
     try:
         up = subprocess.run([HERE / "up.sh", found.folder], capture_output=True, text=True, timeout=120)

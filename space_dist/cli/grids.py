@@ -43,6 +43,7 @@ _MODES = ("auto", "pool", "jobs")
 _LOG_SECONDS = 30.0
 _SHOWN_RUNS = 12
 _WATCH_SECONDS = 1.0
+_QUEUE_SECONDS = 30.0
 _UNFINISHED = 3
 
 
@@ -188,8 +189,11 @@ def grid_status(
     manifest = place.manifest()
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
+    queue, asked = queue_of(place.folder), time.monotonic()
     while True:
-        found, queue = _standings(place, manifest), queue_of(place.folder)
+        if time.monotonic() - asked >= _QUEUE_SECONDS:  # a controller serves everybody
+            queue, asked = queue_of(place.folder), time.monotonic()
+        found = _standings(place, manifest)
         if as_json:
             _print_json(_status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
