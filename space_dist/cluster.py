@@ -5,18 +5,19 @@ Imports neither Ray nor torch: rollout and curriculum actors are made of this mo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
-from space_dist.config import ContextSpaceConfig, FixedConfig, GrowingConfig, RandomGrowthConfig, RunConfig, SpaceConfig
-from space_dist.curricula import Curriculum, Feedback, RoundRobin, Selection, Space, State, variants
+from space_dist.config import GrowingConfig, RunConfig
+from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, Selection, State
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.rollout import FloatArray, Setup, Split, Walk, Worker
+from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Walk, Worker, joined
 
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
@@ -31,6 +32,33 @@ class Decision:
     values: Handle
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """Handles of what an iteration showed, in pieces; `Central.decide` is given their values in the order of fields.
+
+    after: start values of all instances, chunk by chunk.
+    rescored: the values before, chunk by chunk, where scales have changed since and those kept are no longer true.
+    members: start values of all instances by each member of an ensemble, chunk by chunk.
+    episodes: one `Episodes`, whose start values are filled in where the curriculum sits.
+    context_values: start values of the episodes' contexts, where those are no instances.
+    probes: one `Outcomes` per part.
+    """
+
+    after: Sequence[Handle]
+    rescored: Sequence[Handle] = ()
+    members: Sequence[Handle] = ()
+    episodes: Sequence[Handle] = ()
+    context_values: Sequence[Handle] = ()
+    probes: Sequence[Handle] = ()
+
+    def flat(self) -> tuple[dict[str, int], list[Handle]]:
+        """How many handles each field has, and all of them: Ray only sees handles that are arguments themselves."""
+        fields = {field.name: list(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        return {name: len(handles) for name, handles in fields.items()}, [
+            handle for handles in fields.values() for handle in handles
+        ]
+
+
 class Cluster(Protocol):
     """Where work is done. All calls but `get` return at once; handles may be passed on without being waited for."""
 
@@ -43,7 +71,13 @@ class Cluster(Protocol):
         """One `Shard` per shard, of a round that begins after `steps` environment steps."""
 
     def start_values(self, policy: Handle) -> list[Handle]:
-        """One array per chunk of the training instances."""
+        """One array per chunk of the training instances. `policy` may be an ensemble."""
+
+    def context_values(self, policy: Handle, contexts: FloatArray, *, version: int) -> list[Handle]:
+        """One array: the start values of (m, d) contexts of selection `version`."""
+
+    def probe(self, policy: Handle, indices: IntArray, *, version: int) -> list[Handle]:
+        """One `Outcomes` per part, of probe episodes on the training instances at (k,) `indices`."""
 
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """One `Outcomes` per part."""
@@ -52,45 +86,66 @@ class Cluster(Protocol):
         """The curriculum's first decision."""
 
     def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle],
-        *, version: int, gradient_steps: int, rescored: Sequence[Handle] = (),
-    ) -> Decision:  # fmt: skip
-        """The curriculum's next decision, on selection `version`.
-
-        rescored: the values before, chunk by chunk, where scales have changed since and `before` is no longer true.
-        """
+        self, state: Handle, before: Handle, evidence: Evidence, *, version: int, gradient_steps: int
+    ) -> Decision:
+        """The curriculum's next decision, on selection `version`. before: the values that it saw last."""
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values."""
 
 
 class Central:
-    """The curriculum's seat: joins the values of all chunks and asks the curriculum. Pure; keeps no state."""
+    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state."""
 
     def __init__(self, config: RunConfig, train: InstanceSet) -> None:
-        self._curriculum = make_curriculum(config, train)
+        self.curriculum = make_curriculum(config, train)
         self._from_zero = isinstance(config.curriculum, GrowingConfig) and config.curriculum.v0 == "zero"
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
         """The first decision and V_0."""
-        state, selection = self._curriculum.start()
+        state, selection = self.curriculum.start()
         values = checked(np.concatenate(chunks), "start values")
         return state, selection, {}, np.zeros_like(values) if self._from_zero else values
 
     def decide(
-        self, state: State, before: FloatArray, version: int, gradient_steps: int, n_after: int, *chunks: FloatArray
-    ) -> tuple[State, Selection, dict[str, Any], FloatArray]:
-        """The next decision and V_t: the first `n_after` chunks; further ones replace `before`.
+        self, state: State, before: FloatArray, version: int, gradient_steps: int, layout: Mapping[str, int],
+        *pieces: Any,
+    ) -> tuple[State, Selection, dict[str, Any], FloatArray]:  # fmt: skip
+        """The next decision and V_t. layout, pieces: `Evidence.flat`, with values for handles.
 
         Raises RuntimeError if `state` is not the one that made selection `version`.
         """
         if state.version != version:
             raise RuntimeError(f"asked to go on from selection {version} with the state of {state.version}")
-        after = checked(np.concatenate(chunks[:n_after]), "start values")
-        if len(chunks) > n_after and not (self._from_zero and version == 0):
-            before = checked(np.concatenate(chunks[n_after:]), "start values")
-        new, selection, numbers = self._curriculum.step(state, Feedback(version, before, after, gradient_steps))
+        arriving = iter(pieces)
+        seen = {name: [next(arriving) for _ in range(count)] for name, count in layout.items()}
+        after = checked(np.concatenate(seen["after"]), "start values")
+        if seen.get("rescored") and not (self._from_zero and version == 0):
+            before = checked(np.concatenate(seen["rescored"]), "start values")
+        members = checked(np.concatenate(seen["members"]), "values of the ensemble") if seen.get("members") else None
+        feedback = Feedback(
+            version, before, after, gradient_steps, members=members,
+            episodes=next(self._valued(seen, after), None), probes=self._probed(version, seen.get("probes", [])),
+        )  # fmt: skip
+        new, selection, numbers = self.curriculum.step(state, feedback)
         return new, selection, numbers, after
+
+    def _valued(self, seen: Mapping[str, list[Any]], after: FloatArray) -> Iterator[Episodes]:
+        """The episodes with their start values: those of their instances, or of the contexts that were generated."""
+        for episodes in seen.get("episodes", []):
+            values = seen.get("context_values") or [after[episodes.indices]]
+            yield dataclasses.replace(episodes, start_values=checked(np.concatenate(values), "start values"))
+
+    def _probed(self, version: int, parts: list[Outcomes]) -> Probes | None:
+        if not parts:
+            return None
+        indices = self.curriculum.probes(version)
+        if indices is None:
+            raise RuntimeError(f"selection {version} was probed, and nobody asked for that")
+        outcomes = joined(parts)
+        if np.isnan(outcomes.success).any():
+            raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")
+        return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
 
 
 class InProcess:
@@ -116,6 +171,14 @@ class InProcess:
         """See `Cluster`."""
         return [self._worker.start_values(policy, chunk) for chunk in range(self._setup.chunks)]
 
+    def context_values(self, policy: Handle, contexts: FloatArray, *, version: int) -> list[Handle]:
+        """See `Cluster`."""
+        return [self._worker.context_values(policy, contexts, version)]
+
+    def probe(self, policy: Handle, indices: IntArray, *, version: int) -> list[Handle]:
+        """See `Cluster`."""
+        return [self._worker.probe(policy, indices, version, part) for part in range(self._setup.evaluation_parts)]
+
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """See `Cluster`."""
         parts = range(self._setup.evaluation_parts)
@@ -126,13 +189,11 @@ class InProcess:
         return Decision(*self._central.begin(*values))
 
     def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle],
-        *, version: int, gradient_steps: int, rescored: Sequence[Handle] = (),
-    ) -> Decision:  # fmt: skip
+        self, state: Handle, before: Handle, evidence: Evidence, *, version: int, gradient_steps: int
+    ) -> Decision:
         """See `Cluster`."""
-        return Decision(
-            *self._central.decide(state, before, version, gradient_steps, len(after), *after, *rescored)
-        )  # fmt: skip
+        layout, pieces = evidence.flat()
+        return Decision(*self._central.decide(state, before, version, gradient_steps, layout, *pieces))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """The values themselves."""
@@ -140,43 +201,15 @@ class InProcess:
 
 
 def make_curriculum(config: RunConfig, train: InstanceSet) -> Curriculum:
-    """The curriculum a config asks for. Raises ConfigError if it asks for instances that are not there."""
-    settings = config.curriculum
-    if settings.kind == "round_robin":
-        return RoundRobin(train, seed=config.seed)
-    if settings.kind == "fixed":
-        _refuse_missing(settings, train, str(config.instances.train))
-        return RoundRobin(train, seed=config.seed, ids=settings.ids, count=settings.count)
-    return Space(
-        train, seed=config.seed, eta=settings.eta, kappa=settings.kappa, rank=_rank(config, settings, train),
-        mean=settings.mean, growth=settings.growth, adaptive_eta=settings.adaptive_eta, patience=settings.patience,
-        epsilon=settings.epsilon,
-    )  # fmt: skip
+    """The curriculum a config asks for. Raises ConfigError if it asks for instances or features that are not there."""
+    from space_dist.curricula.configured import Makers  # SciPy's optimisers, which rollout actors never need
 
-
-def _rank(
-    config: RunConfig, settings: SpaceConfig | RandomGrowthConfig | ContextSpaceConfig, train: InstanceSet
-) -> variants.Rank:
-    if settings.kind == "cspace":
-        env = config.env
-        bounds = make_batched(env.id, 1, context_visible=False, kwargs=env.kwargs).context_bounds
-        by_distance = {"centroid": variants.near_centroid, "nearest_member": variants.near_member}
-        return by_distance[settings.distance](bounds.scale(train.contexts))
-    if settings.kind == "random_growth" or settings.pic == "random":
-        return variants.at_random(train, seed=config.seed)
-    return variants.BY_VALUE[settings.pic]
-
-
-def _refuse_missing(settings: FixedConfig, train: InstanceSet, source: str) -> None:
-    ids = train.ids.tolist()
-    holds = f"{source} holds {len(ids)} instances, with ids from {ids[0]} to {ids[-1]}"
-    if settings.count is not None and settings.count > len(ids):
-        raise ConfigError(f"curriculum.count: {settings.count} is too many: {holds}")
-    missing = sorted(set(settings.ids or ()).difference(ids))
-    if missing:
-        more = f" (nor {len(missing) - 1} more of these)" if len(missing) > 1 else ""
-        closest = min(ids, key=lambda one: abs(one - missing[0]))
-        raise ConfigError(f"curriculum.ids: there is no instance {missing[0]}{more}; the nearest is {closest}. {holds}")
+    env, rollout = config.env, config.rollout
+    return Makers(
+        train, source=str(config.instances.train), seed=config.seed,
+        draws=Draws(config.n_episodes or config.learner.n_steps, rollout.shards),
+        bounds=lambda: make_batched(env.id, 1, context_visible=False, kwargs=env.kwargs).context_bounds,
+    ).make(config.curriculum)  # fmt: skip
 
 
 def checked(values: FloatArray, what: str) -> FloatArray:

@@ -63,7 +63,24 @@ class InstancesConfig(Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-class GrowingConfig(Section):
+class _Curriculum(Section):
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """Whether it makes no sense where the policy cannot tell instances apart at their start."""
+        return False
+
+    @property
+    def probes(self) -> bool:
+        """Whether it runs probe episodes, whose steps cannot be foreseen."""
+        return False
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of the training instances' CSV that it reads, beside id and features."""
+        return ()
+
+
+class GrowingConfig(_Curriculum):
     """What all curricula share whose set grows by SPaCE's rule."""
 
     eta: float = Field(default=0.1, gt=0.0)
@@ -114,6 +131,19 @@ class SpaceConfig(GrowingConfig):
     allow_context_blind: bool = False
     """Run even though the policy cannot tell instances apart at their start (the released code's PointMass): all values
     tie, and the order is a random one."""
+    reverse: bool = False
+    """Rank the other way round: a control. Source: ours."""
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return self.pic != "random" and not self.allow_context_blind
+
+    @model_validator(mode="after")
+    def _something_to_reverse(self) -> Self:
+        if self.reverse and self.pic == "random":
+            raise ValueError("reverse: true changes nothing with pic: random")
+        return self
 
 
 class RandomGrowthConfig(GrowingConfig):
@@ -137,16 +167,18 @@ class ContextSpaceConfig(GrowingConfig):
     distance: Literal["centroid", "nearest_member"] = "centroid"
     """Euclidean distance, with each feature scaled from its bounds to [-1, 1], to what of the current set: its mean, or
     its nearest instance, which never drops one. Source: the released code (with L1); ours."""
+    reverse: bool = False
+    """Rank the other way round, the farthest first: a control. Source: ours."""
 
 
-class RoundRobinConfig(Section):
+class RoundRobinConfig(_Curriculum):
     """All instances in turn, in a random order fixed by the seed (the paper's first baseline, section 5.2)."""
 
     kind: Literal["round_robin"]
     """Which curriculum: round robin."""
 
 
-class FixedConfig(Section):
+class FixedConfig(_Curriculum):
     """Control: round robin over a part of the training instances. Give either `ids` or `count`."""
 
     kind: Literal["fixed"]
@@ -165,8 +197,202 @@ class FixedConfig(Section):
         return self
 
 
+class ManualConfig(GrowingConfig):
+    """Control: grows in an order that a person wrote down, as a column of the training instances' CSV."""
+
+    kind: Literal["manual"]
+    """Which curriculum: a manual order."""
+    column: str = Field(min_length=1, max_length=100)
+    """Column of instances.train with one number per instance, of any unit: the lowest come first. Source: ours."""
+    growth: Literal["add", "multiply", "schedule"] = "schedule"
+    """schedule: S + kappa after every iteration with a gradient step, whatever the values. add: S + kappa when values
+    settle. multiply: S * kappa then (kappa of at least 2). Source: ours; as SPaCE's."""
+    reverse: bool = False
+    """Highest first. Source: ours."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return (self.column,)
+
+
+class UniformConfig(_Curriculum):
+    """Domain randomisation over the set: every episode's instance is drawn uniformly."""
+
+    kind: Literal["uniform"]
+    """Which curriculum: uniform random."""
+
+
+class SelfPacedConfig(_Curriculum):
+    """SPDRL (Klink et al. 2020): contexts from a normal distribution that moves from an initial one to a target.
+
+    The defaults are the authors' PPO settings on PointMass.
+    """
+
+    kind: Literal["spdrl"]
+    """Which curriculum: self-paced deep RL."""
+    initial_mean: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=_MAX_LIST, strict=False)
+    """Mean of the first contexts, one number a feature, in environment units; null: the middle of the bounds. Source:
+    Klink et al. 2020 on PointMass, which is that middle."""
+    initial_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=_MAX_LIST, strict=False
+    )
+    """Standard deviations of the first contexts, in environment units; null: a quarter of the bounds' width. Source:
+    Klink et al. 2020 on PointMass, which is that quarter."""
+    target: Literal["normal", "set_moments"] = "set_moments"
+    """What the distribution moves to. normal: target_mean and target_std. set_moments: mean and covariance of the
+    training instances. Source: Klink et al. 2020; ours, for sets that are not drawn from a normal distribution."""
+    target_mean: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=_MAX_LIST, strict=False)
+    """With target: normal, its mean, one number a feature, in environment units."""
+    target_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=_MAX_LIST, strict=False
+    )
+    """With target: normal, its standard deviations, in environment units."""
+    zeta: float = Field(default=1.6, gt=0.0)
+    """Weight of the pull to the target: alpha is zeta * mean discounted return / KL. Source: Klink et al. 2020,
+    PointMass (1.6)."""
+    offset: int = Field(default=10, ge=0)
+    """Moves before this one, counted from 1, have alpha 0. Source: Klink et al. 2020, PointMass (PPO 10, TRPO 20)."""
+    epsilon: float = Field(default=0.05, gt=0.0)
+    """Trust region: largest KL divergence, in nats, from one distribution to the next. Source: Klink et al. 2020."""
+    warm_up: int = Field(default=5, ge=0)
+    """Iterations before the distribution first moves. Source: Klink et al. 2020."""
+    optimiser: Literal["trust_constr", "conjugate_gradient"] = "trust_constr"
+    """trust_constr: SciPy's, with the least standard deviations as bounds. conjugate_gradient: one natural gradient
+    step with line search, the standard deviations clamped behind it. Source: Klink et al. 2021 (JMLR); Klink et al.
+    2020."""
+    least_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=_MAX_LIST, strict=False
+    )
+    """The diagonal of the Cholesky factor stays at least this, in environment units, while the target is far; null:
+    no limit. Source: Klink et al. 2020, PointMass (0.2, 0.1875, 0.1)."""
+    least_std_until: float = Field(default=8000.0, ge=0.0)
+    """The target is far while KL(p || target) is above this, in nats. Source: Klink et al. 2020."""
+    allow_context_blind: bool = False
+    """Run even though the policy cannot tell contexts apart at their start: all values tie, and only the target
+    pulls."""
+
+    @model_validator(mode="after")
+    def _whole_target(self) -> Self:
+        given = (self.target_mean is not None, self.target_std is not None)
+        if self.target == "normal" and not all(given):
+            raise ValueError("target: normal needs target_mean and target_std")
+        if self.target == "set_moments" and any(given):
+            raise ValueError("target_mean and target_std say nothing with target: set_moments; use target: normal")
+        return self
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return not self.allow_context_blind
+
+
+class ValueDisagreementConfig(_Curriculum):
+    """The VDS sampler (Zhang et al. 2020) under our learner: instances whose value an ensemble disagrees about.
+
+    The original is HER with DDPG and an ensemble of Q-functions over a replay buffer.
+    """
+
+    kind: Literal["vds"]
+    """Which curriculum: value disagreement."""
+    members: int = Field(default=3, ge=2, le=100)
+    """Value functions in the ensemble. Source: Zhang et al. 2020 (3)."""
+    members_see: tuple[str, ...] | None = Field(default=None, min_length=1, max_length=_MAX_LIST, strict=False)
+    """Features of the context that the members see, such as the goal alone; null: all. The policy sees all in any
+    case. Source: the SPaCE paper, section 5.2 (on Ant, VDS knows goals only)."""
+    learning_rate: float = Field(default=1e-3, gt=0.0)
+    """Step size of the members' Adam. Source: Zhang et al. 2020 (1e-3)."""
+    batch_size: int = Field(default=1000, ge=1)
+    """Transitions per minibatch of the members, at most a round's. Source: Zhang et al. 2020 (1,000)."""
+    n_batches: int = Field(default=100, ge=1)
+    """Minibatches per update. Source: Zhang et al. 2020 (100 a cycle)."""
+    td_lambda: float = Field(default=0.95, ge=0.0, le=1.0)
+    """Lambda of the returns that each member is fitted to, bootstrapped from itself. Source: ours; the original
+    bootstraps Q-functions by one step (0), from a replay buffer."""
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return True
+
+
+class AlpGmmConfig(_Curriculum):
+    """ALP-GMM (Portelas et al. 2019): contexts from a mixture, in proportion to absolute learning progress."""
+
+    kind: Literal["alp_gmm"]
+    """Which curriculum: ALP-GMM."""
+    over: Literal["set", "bounds"] = "set"
+    """set: the training instance nearest to a sample. bounds: the sample itself, generated within the environment's
+    bounds. Source: ours; Portelas et al. 2019."""
+    random_share: float = Field(default=0.3, ge=0.0, le=1.0)
+    """Share of uniform draws. Source: Klink et al. 2021 (JMLR), PointMass (PPO 0.3, TRPO 0.2)."""
+    fit_rate: int = Field(default=100, ge=1)
+    """Finished episodes between fits, rows of a fit, and uniform episodes at the start. Source: Klink et al. 2021
+    (JMLR), PointMass (PPO 100, TRPO 50)."""
+    history: int = Field(default=500, ge=1)
+    """Finished episodes among which the nearest earlier context is sought. Source: Klink et al. 2021 (JMLR), PointMass
+    (500)."""
+    components: int = Field(default=10, ge=2, le=100)
+    """Most components of the mixture; from 2 on, AIC chooses. Source: Portelas et al. 2019 (10)."""
+
+    @model_validator(mode="after")
+    def _enough_rows(self) -> Self:
+        if self.fit_rate < self.components:
+            raise ValueError(f"fit_rate: {self.fit_rate} rows cannot tell {self.components} components apart; "
+                             f"fit_rate must be at least components")  # fmt: skip
+        return self
+
+
+class LevelReplayConfig(_Curriculum):
+    """Prioritised level replay (Jiang et al. 2021): by rank of mean |GAE|, and by how long ago. On-policy learners."""
+
+    kind: Literal["plr"]
+    """Which curriculum: prioritised level replay."""
+    temperature: float = Field(default=0.1, gt=0.0)
+    """Beta: the chance of rank r is proportional to r^(-1/beta). Source: Jiang et al. 2021 (0.1)."""
+    staleness_share: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Rho: weight of the time since an instance was last trained on. Source: Jiang et al. 2021 (0.1)."""
+
+
+class LearnabilityConfig(_Curriculum):
+    """Sampling for learnability (SFL; Rutherford et al. 2024): instances of highest p (1 - p), p the success rate.
+
+    Needs an environment that reports success. Probe episodes cost environment steps, which the budget is charged.
+    """
+
+    kind: Literal["learnability"]
+    """Which curriculum: learnability."""
+    top: int = Field(default=20, ge=1)
+    """Instances that are drawn as learnable. Source: ours, a fifth of 100 (the paper: 1,000 of 5,000)."""
+    uniform_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Share of draws from all instances. Source: Rutherford et al. 2024 (0.5)."""
+    every: int = Field(default=50, ge=1)
+    """Iterations between probes; the first follows the first iteration. Source: Rutherford et al. 2024 (50)."""
+    candidates: int | None = Field(default=None, ge=1)
+    """Instances that a probe takes, at random; null: all. Source: ours."""
+    episodes: int = Field(default=4, ge=2, le=1000)
+    """Probe episodes of each candidate, with the acting policy. Source: ours."""
+
+    @property
+    def probes(self) -> bool:
+        """See `_Curriculum`."""
+        return True
+
+
 CurriculumConfig = Annotated[
-    SpaceConfig | RoundRobinConfig | RandomGrowthConfig | ContextSpaceConfig | FixedConfig, Field(discriminator="kind")
+    SpaceConfig
+    | RoundRobinConfig
+    | RandomGrowthConfig
+    | ContextSpaceConfig
+    | FixedConfig
+    | ManualConfig
+    | UniformConfig
+    | SelfPacedConfig
+    | ValueDisagreementConfig
+    | AlpGmmConfig
+    | LevelReplayConfig
+    | LearnabilityConfig,
+    Field(discriminator="kind"),
 ]
 
 

@@ -31,10 +31,10 @@ from ray.util.placement_group import PlacementGroup, placement_group, placement_
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
-from space_dist.cluster import Central, Decision, Handle
+from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.rollout import Setup, Split, Walk, Worker
+from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
 _ATTEMPTS = 6  # at one call, or at one actor's start, before something must be wrong with the work itself
@@ -187,6 +187,15 @@ class RayCluster:
         """See `cluster.Cluster`."""
         return [self._ask(chunk, "start_values", policy, chunk)[0] for chunk in range(self._setup.chunks)]
 
+    def context_values(self, policy: Handle, contexts: FloatArray, *, version: int) -> list[Handle]:
+        """See `cluster.Cluster`."""
+        return [self._ask(0, "context_values", policy, contexts, version)[0]]
+
+    def probe(self, policy: Handle, indices: IntArray, *, version: int) -> list[Handle]:
+        """See `cluster.Cluster`."""
+        parts = range(self._setup.evaluation_parts)
+        return [self._ask(part, "probe", policy, indices, version, part)[0] for part in parts]
+
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """See `cluster.Cluster`."""
         parts = range(self._setup.evaluation_parts)
@@ -197,12 +206,11 @@ class RayCluster:
         return Decision(*self._ask(_CENTRAL, "begin", *values))
 
     def decide(
-        self, state: Handle, before: Handle, after: Sequence[Handle],
-        *, version: int, gradient_steps: int, rescored: Sequence[Handle] = (),
-    ) -> Decision:  # fmt: skip
+        self, state: Handle, before: Handle, evidence: Evidence, *, version: int, gradient_steps: int
+    ) -> Decision:
         """See `cluster.Cluster`."""
-        asked = (state, before, version, gradient_steps, len(after), *after, *rescored)
-        return Decision(*self._ask(_CENTRAL, "decide", *asked))
+        layout, pieces = evidence.flat()
+        return Decision(*self._ask(_CENTRAL, "decide", state, before, version, gradient_steps, layout, *pieces))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""

@@ -10,7 +10,7 @@ import hashlib
 import stat
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -81,15 +81,17 @@ class InstanceSet:
     """At least one instance, sorted by id, so that the order of a file's rows can decide nothing.
 
     `ids` are `(n,)` int64, ascending, unique and >= 0; `contexts` `(n, d)` float64 in the order of `ids`, without
-    negative zeros; `names` the d features. Both arrays are copies and read-only. Raises ConfigError for anything else.
+    negative zeros; `names` the d features. `columns` are further numbers about each instance, `(n,)` by name, which no
+    environment and no policy sees. All arrays are copies and read-only. Raises ConfigError for anything else.
     """
 
     ids: NDArray[np.int64]
     contexts: NDArray[np.float64]
     names: tuple[str, ...]
+    columns: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_names(self.names)
+        _check_names((*self.names, *self.columns))
         given = np.asarray(self.ids)
         contexts = np.asarray(self.contexts, dtype=np.float64)
         if contexts.ndim != 2 or given.shape != contexts.shape[:1] or contexts.shape[1] != len(self.names):
@@ -115,6 +117,13 @@ class InstanceSet:
             raise ConfigError(f"two instances have the id {ids[repeated[0]]}")
         # + 0.0 turns -0.0 into 0.0: equal contexts shall have equal bytes, and so equal digests
         _freeze(self, ids=ids, contexts=contexts[order] + 0.0)
+        columns = {name: np.asarray(values, dtype=np.float64) for name, values in self.columns.items()}
+        for name, values in columns.items():
+            if values.shape != given.shape or not np.isfinite(values).all():
+                raise ConfigError(f"the column {_shown(name)} must hold one finite number for each instance")
+            columns[name] = values[order] + 0.0
+            columns[name].setflags(write=False)
+        object.__setattr__(self, "columns", columns)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -126,16 +135,19 @@ class InstanceSet:
             self.names == other.names
             and np.array_equal(self.ids, other.ids)
             and np.array_equal(self.contexts, other.contexts)
+            and list(self.columns) == list(other.columns)
+            and all(np.array_equal(self.columns[name], other.columns[name]) for name in self.columns)
         )
 
     def __hash__(self) -> int:
         return hash((self.names, self.ids.tobytes(), self.contexts.tobytes()))
 
     def to_csv(self) -> str:
-        r"""The one canonical text of this set: `id,<names>`, rows by id, shortest round-trip floats, `\n` ends."""
-        rows = zip(self.ids.tolist(), self.contexts.tolist(), strict=True)
-        lines = [",".join((str(identity), *map(repr, context))) for identity, context in rows]
-        return "\n".join((",".join(("id", *self.names)), *lines, ""))
+        r"""The one canonical text of this set: `id,<names>,<columns>`, by id, shortest round-trip floats, `\n` ends."""
+        numbers = np.column_stack((self.contexts, *self.columns.values()))
+        rows = zip(self.ids.tolist(), numbers.tolist(), strict=True)
+        lines = [",".join((str(identity), *map(repr, row))) for identity, row in rows]
+        return "\n".join((",".join(("id", *self.names, *self.columns)), *lines, ""))
 
     def digest(self) -> str:
         """SHA-256, in hex, of the canonical text in UTF-8: equal for equal sets whatever file they came from."""
@@ -150,27 +162,33 @@ class InstanceSet:
         chosen = np.asarray(indices)
         if not np.issubdtype(chosen.dtype, np.integer):
             raise ConfigError(f"a subset is chosen by at least one position, a whole number, not by {chosen.dtype}")
-        return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names)
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names, columns)
 
 
-def read_csv(path: Path, bounds: ContextBounds) -> InstanceSet:
+def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False) -> InstanceSet:
     r"""The instances of a CSV file, checked whole.
 
-    The first line names `id` and exactly the features of `bounds`, in any order; each further line is one instance.
+    The first line names `id`, the features of `bounds` and the further `columns`, in any order, and nothing else; each
+    further line is one instance. With `if_there`, `columns` may be missing.
     Cells are separated by commas; spaces around a cell, double quotes around a cell, a byte order mark, `\r\n` and
     blank lines at the end are accepted. Features come back in the order of `bounds`.
 
     Raises ConfigError, naming the file and where it can the row (the line as an editor numbers it) and the column,
     if the file cannot be read or is larger than 512 MiB, if ids are not whole numbers from 0 to 2**63 - 1, if a
-    feature is not a number within its bounds, or if an id or a context occurs twice.
+    feature is not a number within its bounds, a further column not a finite number, or if an id or a context occurs
+    twice.
     """
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:
-            columns = _read_header(file, bounds)
-            ids, contexts = _read_rows(file, columns, bounds)
+            header = _read_header(file, bounds, columns, if_there)
+            found = [name for name in columns if name in header]
+            ids, numbers = _read_rows(file, header, bounds, found)
+        d = len(bounds.names)
+        contexts = numbers[:, :d]
         _refuse_repeats(ids, contexts)
-        return InstanceSet(ids, contexts, bounds.names)
+        return InstanceSet(ids, contexts, bounds.names, {name: numbers[:, d + i] for i, name in enumerate(found)})
     except ConfigError as fault:
         raise ConfigError(f"{_shown_path(path)}: {fault}") from None
     except OSError as error:
@@ -253,9 +271,10 @@ def _split(row: int, line: bytes) -> list[bytes]:
     return cells
 
 
-def _read_header(file: BinaryIO, bounds: ContextBounds) -> list[str]:
-    """The names of the columns, as the file orders them: `id` and each feature, once each."""
-    expected = ("id", *bounds.names)
+def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], if_there: bool) -> list[str]:
+    """The names of the columns, as the file orders them: `id`, each feature and the further ones, once each."""
+    required = ("id", *bounds.names, *(() if if_there else further))
+    expected = ("id", *bounds.names, *further)
     allowed = f"allowed are {_cut(', '.join(expected), 200)}, each once, separated by commas"
     row, line = next(_lines(file, first_row=1), (1, b""))
     line = line.removeprefix(b"\xef\xbb\xbf")
@@ -275,16 +294,18 @@ def _read_header(file: BinaryIO, bounds: ContextBounds) -> list[str]:
         if column in seen:
             raise ConfigError(f"row 1: the column {_shown(column)} is there twice ({allowed})")
         seen.add(column)
-    for name in expected:
+    for name in required:
         if name not in seen:
             raise ConfigError(f"row 1: the column {_shown(name)} is missing ({allowed})")
     return columns
 
 
 def _read_rows(
-    file: BinaryIO, columns: Sequence[str], bounds: ContextBounds
+    file: BinaryIO, columns: Sequence[str], bounds: ContextBounds, further: Sequence[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """`(n,)` ids and `(n, d)` contexts, features in the order of `bounds`, instances in that of the file.
+    """`(n,)` ids and `(n, d + k)` numbers: features in the order of `bounds`, then `further` columns.
+
+    Instances come in the order of the file.
 
     Row i stands on line i + 2 of the file, because no blank line is accepted before another row.
     """
@@ -294,6 +315,8 @@ def _read_rows(
         (columns.index(name), low, high)
         for name, low, high in zip(bounds.names, bounds.low.tolist(), bounds.high.tolist(), strict=True)
     ]
+    largest = float(np.finfo(np.float64).max)
+    features += [(columns.index(name), -largest, largest) for name in further]
     for row, line in _lines(file, first_row=2):
         if not line:
             _refuse_more(file, row)
@@ -339,6 +362,8 @@ def _cell_fault(row: int, columns: Sequence[str], cells: Sequence[bytes], positi
     cell, column = cells[position].strip(), columns[position]
     if column == "id":
         what, allowed = "is not an id", f"a whole number from 0 to {MAX_ID}"
+    elif column not in bounds.names:
+        what, allowed = "is not a number", "any finite number"
     else:
         feature = bounds.names.index(column)
         allowed = f"a number in [{bounds.low[feature]}, {bounds.high[feature]}]"
@@ -396,9 +421,9 @@ def _check_names(names: tuple[str, ...]) -> None:
 
 def _freeze(owner: ContextBounds | InstanceSet, **arrays: NDArray[np.generic]) -> None:
     """Set fields of a frozen dataclass to arrays that can no longer be written to."""
-    for field, values in arrays.items():
+    for name, values in arrays.items():
         values.setflags(write=False)
-        object.__setattr__(owner, field, values)
+        object.__setattr__(owner, name, values)
 
 
 def _cut(text: str, limit: int) -> str:

@@ -54,10 +54,11 @@ def default_folder(config: RunConfig) -> Path:
 def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
     """The training and test instances of a config. Raises ConfigError for a bad file, or one that shares a context."""
     bounds = make_env(config).context_bounds
+    columns = config.curriculum.columns
     with about("instances.train"):
-        train = read_csv(config.instances.train, bounds)
+        train = read_csv(config.instances.train, bounds, columns)
     with about("instances.test"):
-        test = read_csv(config.instances.test, bounds)
+        test = read_csv(config.instances.test, bounds, columns, if_there=True)
     refuse_overlap(train, test, str(config.instances.train), str(config.instances.test))
     return train, test
 

@@ -150,6 +150,13 @@ class Statistics:
         return np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP).astype(np.float32)
 
 
+class Valuing(Protocol):
+    """Whatever says what states are worth."""
+
+    def values(self, observations: Observations) -> NDArray[np.float64]:
+        """`(n, obs_dim) -> (n, ...)` what the states are worth, in unscaled reward units."""
+
+
 class Policy(Protocol):
     """A policy and its value function as of one update."""
 
@@ -205,6 +212,35 @@ class MlpPolicy:
                 values = np.minimum(values, forward(critic, self.activation, inputs)[:, 0])
         scaled_values: NDArray[np.float64] = values.astype(np.float64) * self.statistics.reward_std
         return scaled_values
+
+
+@dataclass(frozen=True)
+class EnsemblePolicy:
+    """The value functions of an ensemble, each for itself; none of them acts.
+
+    members: the layers of each.  unseen: (k,) positions in an observation that all members see as 0.
+    """
+
+    activation: Activation
+    members: tuple[Layers, ...]
+    unseen: NDArray[np.int64]
+    statistics: Statistics = Statistics()
+
+    def values(self, observations: Observations) -> NDArray[np.float64]:
+        """`(n, obs_dim) -> (n, members)`."""
+        inputs = seen_by_members(_flat(self.statistics.scaled(observations)), self.unseen)
+        values = np.concatenate([forward(member, self.activation, inputs) for member in self.members], axis=1)
+        scaled: NDArray[np.float64] = values.astype(np.float64) * self.statistics.reward_std
+        return scaled
+
+
+def seen_by_members(inputs: Array, unseen: NDArray[np.int64]) -> Array:
+    """`(n, obs_dim)` flat observations without what an ensemble's members do not see."""
+    if not len(unseen):
+        return inputs
+    seen = inputs.copy()
+    seen[:, unseen] = 0.0
+    return seen
 
 
 @dataclass(frozen=True)

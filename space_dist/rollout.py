@@ -20,7 +20,7 @@ from space_dist.envs import BatchedEnv, Observations, make_batched
 from space_dist.envs.observations import allocate, concatenate, put, rows, take
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.policy import Noise, Policy
+from space_dist.policy import Noise, Policy, Valuing
 from space_dist.seeding import Purpose, episode_seeds, generator
 
 FloatArray = NDArray[np.float64]
@@ -119,6 +119,11 @@ class Walk:
             return self.positions[shard] % len(selection.ids)
         return shard * len(selection.ids) // n_shards
 
+    def places(self, selection: Selection, shard: int, n_shards: int, episodes: int) -> IntArray:
+        """`(episodes,)` the places in `selection` of a shard's next episodes."""
+        places: IntArray = (self.position(selection, shard, n_shards) + np.arange(episodes)) % len(selection.ids)
+        return places
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -170,6 +175,7 @@ class Worker:
         self._setup = setup
         self._collecting = setup.make_env(setup.slots)
         self._evaluating: dict[int, BatchedEnv] = {}
+        self._scoring: BatchedEnv | None = None
         self._starts: dict[int, Observations] = {}
 
     def collect(
@@ -193,15 +199,41 @@ class Worker:
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
         )  # fmt: skip
 
-    def start_values(self, policy: Policy, chunk: int) -> FloatArray:
-        """`(chunk_size,)` V(s0, c_i) of one chunk of the training instances: means over their start observations."""
+    def start_values(self, policy: Valuing, chunk: int) -> FloatArray:
+        """`(chunk_size, ...)` V(s0, c_i) of one chunk of the training instances: means over their start observations.
+
+        `...` is what follows the first axis of `policy.values`.
+        """
         if chunk not in self._starts:
             self._starts[chunk] = start_observations(self._setup, chunk)
         observations = self._starts[chunk]
         starts = range(0, rows(observations), BLOCK)
-        blocks = [policy.values(take(observations, slice(row, row + BLOCK))) for row in starts]
-        means: FloatArray = np.concatenate(blocks).reshape(-1, self._setup.start_states).mean(axis=1)
+        values = np.concatenate([policy.values(take(observations, slice(row, row + BLOCK))) for row in starts])
+        means: FloatArray = values.reshape(-1, self._setup.start_states, *values.shape[1:]).mean(axis=1)
         return means
+
+    def context_values(self, policy: Policy, contexts: FloatArray, version: int) -> FloatArray:
+        """`(m,)` V(s0, c) of any (m, d) contexts: means over start observations whose seeds belong to `version`."""
+        setup = self._setup
+        if self._scoring is None:
+            self._scoring = setup.make_env(setup.slots)
+        wanted = np.repeat(contexts, setup.start_states, axis=0)
+        seeds = episode_seeds(setup.seed, Purpose.CONTEXT_STARTS, version, count=len(wanted))
+        values = np.empty(len(wanted))
+        for first in range(0, len(wanted), setup.slots):
+            some = slice(first, first + setup.slots)
+            observations = self._scoring.reset(np.arange(len(wanted[some])), wanted[some], seeds[some])
+            values[some] = policy.values(take(observations, slice(None)))
+        means: FloatArray = values.reshape(-1, setup.start_states).mean(axis=1)
+        return means
+
+    def probe(self, policy: Policy, indices: IntArray, version: int, part: int) -> Outcomes:
+        """Episodes of the acting policy, noise and all, on one part of the training instances at (k,) `indices`."""
+        setup = self._setup
+        seeds = episode_seeds(setup.seed, Purpose.PROBE_EPISODES, version, count=len(indices))
+        mine = np.array_split(np.arange(len(indices)), setup.evaluation_parts)[part]
+        random = generator(setup.seed, Purpose.PROBE_EPISODES, version, part)
+        return self._episodes(policy, setup.train.contexts[indices[mine]], seeds[mine], random)
 
     def evaluate(self, policy: Policy, split: Split, part: int, *, stochastic: bool = False) -> Outcomes:
         """Episodes on one part of a split: deterministic ones, or `stochastic` ones for the released code's metric."""
@@ -212,17 +244,24 @@ class Worker:
         )
         contexts = np.repeat(instances.contexts, episodes, axis=0)
         mine = np.array_split(np.arange(len(seeds)), setup.evaluation_parts)[part]
-        if not len(mine):
+        random = generator(setup.seed, Purpose.EVALUATION, 2 if split == "train" else 3, part) if stochastic else None
+        return self._episodes(policy, contexts[mine], seeds[mine], random)
+
+    def _episodes(
+        self, policy: Policy, contexts: FloatArray, seeds: NDArray[np.uint64], random: np.random.Generator | None
+    ) -> Outcomes:
+        """One episode for each of the (k, d) contexts, at once, on environments of their own."""
+        count = len(contexts)
+        if not count:
             nothing = np.zeros(0)
             return Outcomes(policy.version, nothing, nothing, nothing.astype(np.int64), nothing, nothing)
-        if len(mine) not in self._evaluating:
-            self._evaluating[len(mine)] = setup.make_env(len(mine))
-        env = self._evaluating[len(mine)]
+        if count not in self._evaluating:
+            self._evaluating[count] = self._setup.make_env(count)
+        env = self._evaluating[count]
         noise = None
-        if stochastic:
-            random = generator(setup.seed, Purpose.EVALUATION, 2 if split == "train" else 3, part)
+        if random is not None:
             noise = Noise.draw(policy.head, env.action_space, random, (env.horizon, env.n_slots))
-        return evaluate(env, policy, contexts[mine], seeds[mine], gamma=setup.gamma, noise=noise)
+        return evaluate(env, policy, contexts, seeds, gamma=self._setup.gamma, noise=noise)
 
 
 def collect(

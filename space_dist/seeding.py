@@ -30,6 +30,13 @@ class Purpose(enum.IntEnum):
     RANDOM_GROWTH = 8
     INSTANCES = 9
     BOOTSTRAP = 10
+    DRAWS = 11
+    PROBED = 12
+    PROBE_EPISODES = 13
+    CONTEXT_STARTS = 14
+    MIXTURE = 15
+    ENSEMBLE = 16
+    ENSEMBLE_UPDATE = 17
 
 
 def seed_sequence(seed: int, purpose: Purpose, *keys: int) -> np.random.SeedSequence:

@@ -4,36 +4,39 @@
     repeat
         collect  cluster.collect(policy, selection)      exactly n_steps transitions, in shards
         update   learner.update(shards)                  SB3's own train()
-        until the selection was passed over once at full horizon, then
+        until the selection was passed over once at full horizon (draws: after one update), then
         revalue  cluster.start_values(policy)            V(s0, c) of every instance, straight to the curriculum
-        select   cluster.decide(state, before, after)    the next selection
+        select   cluster.decide(state, evidence)         the next selection, from that and what else was asked for
     now and then: evaluate on all instances, and commit to the ledger
 
 The driver waits once per round, for the shards. What is asked for at the end of a round (decision, evaluation) is
-picked up at the next wait, or before a commit: `_settle`. A run is a pure function of (config, seed).
+picked up at the next wait, or before a commit: `_settle`. Only where a curriculum probes instances does it wait for
+those episodes as well: how many steps they took decides whether the budget has room for another round. A run is a pure
+function of (config, seed).
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from space_dist.cluster import Cluster, Decision, Handle, checked, make_curriculum
+from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
 from space_dist.config import RunConfig
-from space_dist.curricula import Selection, State
+from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
-from space_dist.learner import Arrays, Learner, Update, make_learner, refuse_spaces
+from space_dist.learner import Arrays, Ensemble, Learner, Update, make_ensemble, make_learner, refuse_spaces
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
 from space_dist.policy import MlpPolicy, Policy, blind, to_arrays
 from space_dist.rollout import (
@@ -48,6 +51,7 @@ from space_dist.rollout import (
 
 log = logging.getLogger("space_dist")
 
+ON_POLICY = ("ppo", "trpo", "a2c")
 PROBE = (1 << 32) - 1  # the round in which first scales are measured
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
 
@@ -86,33 +90,65 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         )
     env = make_env(config)
     refuse_spaces(config.learner, env.observation_space, env.action_space)
-    curriculum = config.curriculum
-    if (
-        curriculum.kind == "space"
-        and curriculum.pic != "random"
-        and not curriculum.allow_context_blind
-        and _starts_alike(config, train)
-    ):
+    if config.curriculum.ranks_by_start_value and _starts_alike(config, train):
         raise ConfigError(
-            "curriculum.kind: space ranks instances by the value of their start, but all instances start with the same "
-            "observation, so all values tie and the order would be a random one. Set env.context_visible: true, or "
-            "curriculum.allow_context_blind: true to run the released code's setting"
+            f"curriculum.kind: {config.curriculum.kind} ranks instances by the value of their start, but all instances "
+            "start with the same observation, so all values tie and the order would be a random one. Set "
+            "env.context_visible: true"
+            + (
+                ", or curriculum.allow_context_blind: true to run the released code's setting"
+                if "allow_context_blind" in type(config.curriculum).model_fields
+                else ""
+            )
         )
-    make_curriculum(config, train)  # asks for instances that are not there? Better refused now than on an actor
+    # Asks the curriculum for what is not there? Better refused now than on an actor.
+    _refuse_wants(config, make_curriculum(config, train))
+    ensemble_of(config)
     return setup
+
+
+def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
+    """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
+    kind, learner = config.curriculum.kind, config.learner.kind
+    if curriculum.wants.advantages and learner not in ON_POLICY:
+        raise ConfigError(
+            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
+            f"compute. Allowed learners: {', '.join(ON_POLICY)}"
+        )
+    if config.curriculum.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
+        raise ConfigError(
+            f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
+            "not say (its steps have no `success`)"
+        )
+
+
+def _knows_success(config: RunConfig, contexts: NDArray[np.float64]) -> bool:
+    """Whether a first step in a (1, d) context reports success, true or not."""
+    with _failures_explained(config, "reset or a first step"):
+        env = make_env(config)
+        env.action_space.seed(0)
+        env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
+        return env.step(np.asarray(env.action_space.sample())[None]).success is not None
 
 
 def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
     """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
     slots = min(len(train), _COMPARED_STARTS)
-    seeds = np.zeros(slots, dtype=np.uint64)
+    with _failures_explained(config, "reset"):
+        env = make_env(config, slots)
+        starts = env.reset(np.arange(slots), train.contexts[:slots], np.zeros(slots, dtype=np.uint64))
+    return slots > 1 and alike(starts)
+
+
+@contextlib.contextmanager
+def _failures_explained(config: RunConfig, what: str) -> Iterator[None]:
+    """Somebody else's environment may raise anything."""
     try:
-        starts = make_env(config, slots).reset(np.arange(slots), train.contexts[:slots], seeds)
+        yield
     except ConfigError:
         raise
-    except Exception as error:  # somebody else's code may raise anything
-        raise ConfigError(f"env.id {config.env.id!r}: reset failed: {type(error).__name__}: {error}") from error
-    return slots > 1 and alike(starts)
+    except Exception as error:
+        raise ConfigError(f"env.id {config.env.id!r}: {what} failed: {type(error).__name__}: {error}") from error
 
 
 @dataclass
@@ -147,6 +183,7 @@ class _Run:
     scored: Arrays = field(default_factory=dict)  # weights that `values` belong to, where scales change
     segments: list[Segment] = field(default_factory=list)  # of the replay buffer, as of the last commit
     trained: Selection | None = None  # the selection being trained on, once known
+    seen: list[Episodes] = field(default_factory=list)  # of this iteration's rounds, where anyone asks for them
     # Handles, and what they wait for
     state: Handle = None
     selection: Handle = None
@@ -181,6 +218,8 @@ class Training:
         self._horizon = make_env(config).horizon
         self._total_steps = total_steps(config, self._horizon)
         self.learner = learner_of(config)
+        self.ensemble = ensemble_of(config)
+        self._curriculum = make_curriculum(config, setup.train)
         self._run = _Run()
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
@@ -197,8 +236,7 @@ class Training:
                 cluster.collect(policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version)
             )
             steps = run.steps + sum(shard.steps for shard in shards)
-            update = self.learner.update(shards, round=run.round, steps=steps)
-            self._account(shards, update)
+            self._account(shards, self._update(shards, steps))
             policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
                 self._decide(policy)
@@ -208,11 +246,11 @@ class Training:
             self._commit_if_due()
         self._finish()
 
-    def _is_over(self) -> bool:
-        """Whether another round would exceed the budget."""
+    def _is_over(self, reserved: int = 0) -> bool:
+        """Whether another round, and `reserved` steps before it, would exceed the budget."""
         run, budget = self._run, self._config.budget
         enough = budget.episodes is not None and run.episodes >= budget.episodes
-        return enough or run.steps + self._config.round_steps(self._horizon) > budget.steps
+        return enough or run.steps + reserved + self._config.round_steps(self._horizon) > budget.steps
 
     # ---- the parts of an iteration ----
 
@@ -228,7 +266,7 @@ class Training:
     def _probe(self) -> None:
         """One round of actions that ignore the observation gives the first scales; its steps count like any others."""
         run, cluster = self._run, self._cluster
-        selection = make_curriculum(self._config, self._setup.train).start()[1]
+        selection = self._curriculum.start()[1]
         seeing = self.learner.policy(0)
         policy = blind(seeing, self._setup.make_env(1).action_space, PROBE)
         handles = cluster.collect(
@@ -238,15 +276,22 @@ class Training:
         self.learner.observe(shards)
         run.steps += sum(shard.steps for shard in shards)
 
+    def _update(self, shards: list[Shard], steps: int) -> Update:
+        """Learn from a round; `steps`: of the run, with these shards."""
+        scales = self.learner.statistics  # the ones that the round was collected under
+        update = self.learner.update(shards, round=self._run.round, steps=steps)
+        if self.ensemble is None:
+            return update
+        metrics = self.ensemble.update(shards, scales, round=self._run.round)
+        return dataclasses.replace(update, metrics={**update.metrics, **metrics})
+
     def _decide(self, policy: Handle) -> None:
-        """Revalue all instances and let the curriculum choose; the answer is picked up at the next wait."""
+        """Gather what the curriculum asks for and let it choose; the answer is picked up at the next wait."""
         run, cluster = self._run, self._cluster
-        rescored = []
-        if self.learner.normalises:  # both values at one scale: else a change of scale would look like progress
-            rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
+        probes = self._probe_instances(policy)
         decision = cluster.decide(
-            run.state, run.values, cluster.start_values(policy),
-            version=run.version, gradient_steps=run.gradient_steps, rescored=rescored,
+            run.state, run.values, self._evidence(policy, probes),
+            version=run.version, gradient_steps=run.gradient_steps,
         )  # fmt: skip
         row = self._iteration_row(complete=True)
 
@@ -259,7 +304,38 @@ class Training:
         self._adopt(decision)
         run.iteration += 1
         run.version += 1
-        run.rollouts, run.updates, run.gradient_steps = [], [], 0
+        run.rollouts, run.updates, run.seen, run.gradient_steps = [], [], [], 0
+
+    def _probe_instances(self, policy: Handle) -> list[Outcomes]:
+        """Run the probe episodes that the curriculum asks for, if any, and charge their steps to the budget.
+
+        There are none where they, at their longest, would leave no room for another round.
+        """
+        run, cluster = self._run, self._cluster
+        indices = self._curriculum.probes(run.version)
+        if indices is None or self._is_over(reserved=len(indices) * self._horizon):
+            return []
+        outcomes: list[Outcomes] = self._settle(cluster.probe(policy, indices, version=run.version))
+        run.steps += sum(int(part.lengths.sum()) for part in outcomes)
+        return outcomes
+
+    def _evidence(self, policy: Handle, probes: list[Outcomes]) -> Evidence:
+        """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
+        run, cluster, wants = self._run, self._cluster, self._curriculum.wants
+        rescored, members, episodes, context_values = [], [], [], []
+        if self.learner.normalises:  # both values at one scale: else a change of scale would look like progress
+            rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
+        if self.ensemble is not None:
+            members = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
+        if wants.episodes:
+            seen = _joined_episodes(run.seen)
+            episodes = [cluster.put(seen)]
+            if (seen.indices == GENERATED).any():
+                context_values = cluster.context_values(policy, seen.contexts, version=run.version)
+        return Evidence(
+            after=cluster.start_values(policy), rescored=rescored, members=members, episodes=episodes,
+            context_values=context_values, probes=[cluster.put(part) for part in probes],
+        )  # fmt: skip
 
     def _adopt(self, decision: Decision) -> None:
         run = self._run
@@ -277,9 +353,10 @@ class Training:
         run, config = self._run, self._config
         episodes = config.rollout.passes * len(selection.ids)
         per_round = config.n_episodes or config.learner.n_steps / self._horizon
-        run.rounds_left = max(1, math.ceil(episodes / per_round))
+        run.rounds_left = 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
         run.trained = selection
-        self.progress.set_size = len(selection.ids)
+        if not selection.drawn:
+            self.progress.set_size = len(selection.ids)
 
     def _evaluate(self, policy: Handle) -> None:
         run, cluster = self._run, self._cluster
@@ -315,6 +392,11 @@ class Training:
         selection = run.trained
         if selection is None or run.rounds_left is None:
             raise RuntimeError("a round ended before its selection was known")
+        if self._curriculum.wants.episodes:
+            places = [run.walk.places(selection, shard.shard, n_shards, len(shard.episodes)) for shard in shards]
+            run.seen.append(
+                _episodes(self._setup.train, selection, np.concatenate(places), shards, update.advantages)
+            )  # fmt: skip
         run.walk = Walk(
             order,
             tuple(
@@ -335,7 +417,7 @@ class Training:
         if run.rollouts:  # the budget ended inside an iteration: its steps are told, its decision never falls
             self._settle()
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
-            run.rollouts, run.updates = [], []
+            run.rollouts, run.updates, run.seen = [], [], []
         self._commit("done")
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
@@ -362,9 +444,13 @@ class Training:
         run = self._run
         if run.trained is None:
             raise RuntimeError("an iteration ended before its selection was known")
-        self._writer.append(
-            CURRICULUM, {"iteration": run.iteration, "steps": run.steps, "trained": run.trained.ids.tolist()}
-        )
+        trained: Row = {"trained": run.trained.ids.tolist()}
+        if run.trained.drawn:  # the draws that became episodes
+            seen = _joined_episodes(run.seen)
+            generated = seen.indices == GENERATED
+            trained = {"trained": np.where(generated, GENERATED, self._setup.train.ids[seen.indices]).tolist()}
+            trained |= {"contexts": seen.contexts.tolist()} if generated.any() else {}
+        self._writer.append(CURRICULUM, {"iteration": run.iteration, "steps": run.steps, **trained})
         totals = {name: sum(one[name] for one in run.rollouts) for name in run.rollouts[0]}
         finished = totals["finished"]
         return {
@@ -431,11 +517,14 @@ class Training:
         arrays, learner = self.learner.save()
         arrays = {f"learner/{name}": array for name, array in arrays.items()}
         state, values = self._cluster.get([run.state, run.values])
-        arrays["curriculum/values"] = values
-        arrays["curriculum/selected"] = state.selected
-        fields = [item.name for item in dataclasses.fields(state) if item.name != "selected"]
-        numbers = {name: getattr(state, name) for name in fields}
+        remembered, numbers = encode_state(state)
+        arrays["values"] = values
+        arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
         arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
+        if run.seen:
+            arrays |= {f"seen/{name}": array for name, array in vars(_joined_episodes(run.seen)).items()}
+        if self.ensemble is not None:
+            arrays |= {f"ensemble/{name}": array for name, array in self.ensemble.save().items()}
         self._store_transitions()
         data = {
             "learner": learner,
@@ -474,13 +563,20 @@ class Training:
             setattr(run, name, data[name])
         order, positions = data["walk"]
         run.walk = Walk(order, tuple(positions))
-        state = State(selected=checkpoint.arrays["curriculum/selected"], **checkpoint.data["curriculum"])
-        selection = make_curriculum(self._config, self._setup.train).selection(state)
+        arrays = checkpoint.arrays
+        state = decode_state(
+            self._curriculum.state_type, _under("curriculum/", arrays), checkpoint.data["curriculum"]
+        )  # fmt: skip
+        selection = self._curriculum.selection(state)
         self._know_selection(selection)
         run.rounds_left = data["rounds_left"]
         run.state, run.selection = cluster.put(state), cluster.put(selection)
-        run.values = cluster.put(checkpoint.arrays["curriculum/values"])
-        run.scored = _under("scored/", checkpoint.arrays)
+        run.values = cluster.put(arrays["values"])
+        run.scored = _under("scored/", arrays)
+        seen = _under("seen/", arrays)
+        run.seen = [Episodes(**seen)] if seen else []
+        if self.ensemble is not None:
+            self.ensemble.load(_under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
         return cluster.put(self.learner.policy(run.round))
 
@@ -496,8 +592,11 @@ def make_env(config: RunConfig, n_slots: int = 1) -> BatchedEnv:
 
 
 def total_steps(config: RunConfig, horizon: int) -> int:
-    """Environment steps of a whole run: those of the rounds that fit; the budget, where rounds end by episodes."""
-    if config.n_episodes is not None:
+    """Environment steps of a whole run: those of the rounds that fit.
+
+    The budget, where rounds end by episodes or probes come between them.
+    """
+    if config.n_episodes is not None or config.curriculum.probes:
         return config.budget.steps
     return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
 
@@ -510,6 +609,12 @@ def learner_of(config: RunConfig) -> Learner:
         seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots,
         slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
     )  # fmt: skip
+
+
+def ensemble_of(config: RunConfig) -> Ensemble | None:
+    """The ensemble of value functions that a config's curriculum asks for, if it does, with its initial networks."""
+    env = make_env(config)
+    return make_ensemble(config, env.observation_space, env.context_bounds.names)
 
 
 def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy:
@@ -545,6 +650,32 @@ def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int
         marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
         return next(mark for mark in marks if mark > evaluated_at)
     return (evaluated_at // every_steps + 1) * every_steps
+
+
+def _episodes(
+    train: InstanceSet, selection: Selection, places: NDArray[np.int64], shards: Sequence[Shard],
+    advantages: NDArray[np.float64] | None,
+) -> Episodes:  # fmt: skip
+    """A round's episodes, which stand at `places` in the selection, for the curriculum; start values are not known."""
+    tables = [shard.episodes for shard in shards]
+
+    def column(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(table, name) for table in tables])
+
+    ids, unknown = column("ids"), np.full(len(places), np.nan)
+    return Episodes(
+        indices=np.where(ids == GENERATED, GENERATED, np.searchsorted(train.ids, ids)),
+        contexts=selection.contexts[places],
+        returns=column("returns"), discounted_returns=column("discounted_returns"), lengths=column("lengths"),
+        success=column("success"), finished=column("ends") != CUT, start_values=unknown,
+        advantages=unknown if advantages is None else advantages,
+    )  # fmt: skip
+
+
+def _joined_episodes(parts: Sequence[Episodes]) -> Episodes:
+    """The episodes of all rounds of an iteration, in order."""
+    names = [field.name for field in dataclasses.fields(Episodes)]
+    return Episodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def _rollout_sums(shards: list[Shard]) -> dict[str, float]:

@@ -611,7 +611,7 @@ def kinds(section: str) -> list[str]:
     return [get_args(option.model_fields["kind"].annotation)[0] for option in options]
 
 
-NEEDED = {"fixed": {"count": 4}}  # what a kind cannot do without
+NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"}}  # what a kind cannot do without
 CONFIGS = {path.stem: load(path) for path in SHIPPED}
 CONFIGS |= {f"{section}_{kind}": load(SPACE, [f"{section}={json.dumps({'kind': kind, **NEEDED.get(kind, {})})}"])
             for section in ("learner", "curriculum") for kind in kinds(section)}  # fmt: skip
@@ -624,6 +624,7 @@ OTHER_WORDS = {
     "tracking.uri": "http://localhost:5000",
     "tracking.experiment": "another",
     "resources.address": "auto",
+    "curriculum.column": "effort",
 }
 # What decides no result, and so is no part of a run's identity: when it is saved, where it is mirrored, what it runs
 # on, and where its instance files lie (their content enters by digest).
@@ -632,12 +633,13 @@ UNIDENTIFYING = (*NOT_IDENTITY, "instances")
 # rounds of whole episodes in more than one slot.
 COMPANIONS: dict[str, dict[str, Any]] = {
     "curriculum.growth": {"curriculum.kappa": 2},
+    "curriculum.adaptive_eta": {"curriculum.growth": "add"},
     "rollout.shards": {"learner.n_episodes": None},
     "rollout.slots": {"learner.n_episodes": None},
     "learner.n_episodes": {"rollout.shards": 1, "rollout.slots": 1},
 }
-# Refused together with `count`; see test_identity_depends_on_the_fixed_subset.
-INSEPARABLE = ("curriculum.ids",)
+# Valid only together with others; see test_identity_depends_on_the_fixed_subset and ..._on_the_target.
+INSEPARABLE = ("curriculum.ids", "curriculum.target", "curriculum.target_mean", "curriculum.target_std")
 CASES = [(name, key) for name, config in CONFIGS.items() for key, _ in leaves(config.model_dump(mode="json"))
          if not key.endswith(".kind") and key not in INSEPARABLE]  # fmt: skip
 
@@ -664,7 +666,7 @@ def candidates(config: RunConfig, key: str, value: Any) -> list[Any]:
         return [value * 2 or 1, value / 2 or 0.5, *words]
     if isinstance(value, list):
         return [[32, 32]]
-    return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1]
+    return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1, [0.5, 0.5], ["a"]]
 
 
 def pair(config: RunConfig, key: str) -> tuple[RunConfig, RunConfig]:
@@ -706,6 +708,12 @@ def test_identity_depends_on_everything_that_decides_results_and_on_nothing_else
 def test_identity_depends_on_the_fixed_subset() -> None:
     chosen = ["ids: [1]", "ids: [2]", "ids: [1, 2]", "count: 1", "count: 2"]
     assert len({ident(load(SPACE, [f"curriculum={{kind: fixed, {text}}}"])) for text in chosen}) == len(chosen)
+
+
+def test_identity_depends_on_the_target_of_self_paced_contexts() -> None:
+    chosen = ["set_moments", *(f"normal, target_mean: [{mean}], target_std: [{std}]"
+                               for mean, std in ((1, 1), (2, 1), (1, 2)))]  # fmt: skip
+    assert len({ident(load(SPACE, [f"curriculum={{kind: spdrl, target: {text}}}"])) for text in chosen}) == len(chosen)
 
 
 def test_identity_depends_on_the_kinds() -> None:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from space_dist.curricula import Curriculum, Feedback, RoundRobin, Selection, Space, State, variants
+from space_dist.curricula import Curriculum, Feedback, RoundRobin, Selection, SetState, Space, variants
 from space_dist.curricula.space import _highest
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
 from space_dist.rollout import Walk
@@ -38,7 +38,7 @@ def make(kind: str, instances: InstanceSet, *, eta: float = 0.125, kappa: int = 
     return Space(instances, eta=eta, kappa=kappa, seed=seed, rank=rank)
 
 
-def feedback(state: State, before: Any, after: Any, gradient_steps: int = 1) -> Feedback:
+def feedback(state: SetState, before: Any, after: Any, gradient_steps: int = 1) -> Feedback:
     return Feedback(
         state.version, np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64), gradient_steps
     )
@@ -46,10 +46,10 @@ def feedback(state: State, before: Any, after: Any, gradient_steps: int = 1) -> 
 
 def drive(
     curriculum: Curriculum, values: Any, gradient_steps: Sequence[int] | None = None
-) -> list[tuple[State, Selection, dict[str, Any]]]:
+) -> list[tuple[SetState, Selection, dict[str, Any]]]:
     """What a curriculum decides on a history of values (T + 1, n), its first selection included."""
     values = np.asarray(values, dtype=np.float64)
-    decided: list[tuple[State, Selection, dict[str, Any]]] = [(*curriculum.start(), {})]
+    decided: list[tuple[SetState, Selection, dict[str, Any]]] = [(*curriculum.start(), {})]
     for t in range(1, len(values)):
         state = decided[-1][0]
         steps = 1 if gradient_steps is None else gradient_steps[t - 1]
@@ -57,7 +57,7 @@ def drive(
     return decided
 
 
-def plain(state: State) -> dict[str, Any]:
+def plain(state: SetState) -> dict[str, Any]:
     return {**dataclasses.asdict(state), "selected": state.selected.tolist()}
 
 
@@ -65,7 +65,7 @@ def shown(selection: Selection) -> tuple[int, list[int], list[list[float]], int]
     return selection.version, selection.ids.tolist(), selection.contexts.tolist(), selection.order_version
 
 
-def as_plain(decided: Sequence[tuple[State, Selection, dict[str, Any]]]) -> list[Any]:
+def as_plain(decided: Sequence[tuple[SetState, Selection, dict[str, Any]]]) -> list[Any]:
     return [(plain(state), shown(selection), numbers) for state, selection, numbers in decided]
 
 
@@ -87,7 +87,7 @@ class Row(NamedTuple):
 
 def check_trace(curriculum: Space, first: list[int], initial: tuple[float, ...], rows: list[Row]) -> None:
     """Start from the ids `first`, so that no trace hangs on what the seed draws."""
-    state = State(version=0, order_version=0, size=len(first), selected=np.array(first) - 1)
+    state = SetState(version=0, order_version=0, size=len(first), selected=np.array(first) - 1)
     before = initial
     for t, row in enumerate(rows, start=1):
         assert curriculum.selection(state).ids.tolist() == row.trained, f"trained in t={t}"
@@ -208,7 +208,7 @@ def test_the_other_readings_of_lines_6_and_7_are_logged():
         ([(8, 16, 64, 32), (8.5, 18, 65, 33.5), (9.25, 19, 65.5, 35.5)], 31.5 / 8.5, 3.5 / 116.5),
         ([(8, 16, 64, 32), (16, 25, 60, 31), (17, 16.5, 60, 33)], 0.5 / 16, 8.5 / 25),
     ]:
-        state = State(version=0, order_version=0, size=1, selected=np.array([0]))
+        state = SetState(version=0, order_version=0, size=1, selected=np.array([0]))
         state, _, first = space.step(state, feedback(state, values[0], values[1]))
         _, _, second = space.step(state, feedback(state, values[1], values[2]))
         assert first["relative_change_as_printed"] is None  # the printed V_0 = 0 has no share
@@ -218,7 +218,7 @@ def test_the_other_readings_of_lines_6_and_7_are_logged():
 
 def test_changes_of_opposite_sign_cancel_in_the_mean_but_not_in_the_change_of_each():
     # {1, 2}: 8 -> 12 and 24 -> 20. Means 16 -> 16: grown. Each for itself: (4 + 4) / 2 / 16 = 1/4.
-    state = State(version=0, order_version=0, size=2, selected=np.array([0, 1]))
+    state = SetState(version=0, order_version=0, size=2, selected=np.array([0, 1]))
     space = Space(make_set(4), eta=0.125, kappa=1, seed=0)
     _, _, numbers = space.step(state, feedback(state, (8, 24, 0, 0), (12, 20, 1, -1)))
     assert (numbers["grew"], numbers["relative_change"], numbers["relative_change_each"]) == (True, 0.0, 0.25)
@@ -229,7 +229,7 @@ def test_changes_of_opposite_sign_cancel_in_the_mean_but_not_in_the_change_of_ea
 
 def test_ties_stand_in_the_order_of_the_seeded_key():
     instances = make_set(4)
-    state = State(version=0, order_version=0, size=4, selected=np.arange(4))
+    state = SetState(version=0, order_version=0, size=4, selected=np.arange(4))
     orders = set()
     for seed in range(20):
         keys = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
@@ -294,7 +294,7 @@ def test_neither_rows_nor_columns_of_the_file_decide_anything(tmp_path: Path, ki
     ],
 )
 def test_line_7_at_its_boundaries(eta: float, before: float, after: float, grew: bool):
-    state = State(version=0, order_version=0, size=1, selected=np.array([2]))
+    state = SetState(version=0, order_version=0, size=1, selected=np.array([2]))
     space = Space(make_set(4), eta=eta, kappa=1, seed=0)
     others = (100.0, -50.0)  # of instances that were not trained on: the means must not see them
     new, _, numbers = space.step(
@@ -372,7 +372,7 @@ class Case(NamedTuple):
     def make(self, kind: str, order: Sequence[int] | None = None) -> Curriculum:
         return make(kind, make_set(self.n, order), eta=self.eta, kappa=self.kappa, seed=self.seed)
 
-    def drive(self, kind: str, order: Sequence[int] | None = None) -> list[tuple[State, Selection, dict[str, Any]]]:
+    def drive(self, kind: str, order: Sequence[int] | None = None) -> list[tuple[SetState, Selection, dict[str, Any]]]:
         return drive(self.make(kind, order), self.values, self.gradient_steps)
 
 
@@ -453,7 +453,7 @@ def test_the_order_of_rows_is_irrelevant(case: Case, kind: str, random: Any):
     assert as_plain(case.drive(kind, order)) == as_plain(case.drive(kind))
 
 
-def stored_and_restored(state: State) -> State:
+def stored_and_restored(state: SetState) -> SetState:
     """Through JSON and npz, as a checkpoint does it."""
     numbers = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
     file = io.BytesIO()
@@ -461,7 +461,7 @@ def stored_and_restored(state: State) -> State:
     text = json.dumps(numbers, allow_nan=False)
     file.seek(0)
     with np.load(file, allow_pickle=False) as arrays:
-        return State(selected=arrays["selected"], **json.loads(text))
+        return SetState(selected=arrays["selected"], **json.loads(text))
 
 
 @given(cases(), kinds)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from space_dist.cluster import Central, make_curriculum
 from space_dist.config import RunConfig, load
-from space_dist.curricula import Curriculum, RoundRobin, Space, State, variants
+from space_dist.curricula import Curriculum, RoundRobin, SetState, Space, variants
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
@@ -36,7 +36,7 @@ def config_with(curriculum: str, *overrides: str) -> RunConfig:
 
 def follow(curriculum: Curriculum, first: Sequence[int], values: Sequence[Sequence[float]], steps: Any = None) -> Any:
     """(ids, grew, numbers, state) of each decision from the ids `first` on values V_0, V_1, ..."""
-    state = State(version=0, order_version=0, size=len(first), selected=np.array(first) - 1)
+    state = SetState(version=0, order_version=0, size=len(first), selected=np.array(first) - 1)
     decided = []
     for t, (before, after) in enumerate(itertools.pairwise(values)):
         state, selection, numbers = curriculum.step(state, feedback(state, before, after, steps[t] if steps else 1))
@@ -99,7 +99,7 @@ def test_trace_of_each_ranking_by_value(pic: Any, expected: list[tuple[list[int]
 
 def test_relative_takes_shares_of_at_least_1e_8():
     # 1e-6 / 1e-8 = 100, not 1e-6 / 0;  4 / 4 = 1;  2 / |-4| = 0.5;  -8 / 8 = -1.
-    everything = State(version=0, order_version=0, size=4, selected=np.arange(4))
+    everything = SetState(version=0, order_version=0, size=4, selected=np.arange(4))
     curriculum = space(rank=variants.relative)
     _, selection, _ = curriculum.step(everything, feedback(everything, (0, 4, -4, 8), (1e-6, 8, -2, 0)))
     assert selection.ids.tolist() == [1, 2, 3, 4]
@@ -165,17 +165,21 @@ def test_v0_zero_makes_the_first_changes_the_values_themselves():
     # The network says (8, 16, 64, 32) before and (8.5, 18, 60, 33) after the first update.
     # network: d_1 = (0.5, 2, -4, 1), and |8.5 - 8| <= 1.    zero: d_1 = (8.5, 18, 60, 33), and |8.5 - 0| > 1e-8 / 8.
     first, second = np.array([8.0, 16, 64, 32]), np.array([8.5, 18, 60, 33])
-    start = State(version=0, order_version=0, size=1, selected=np.array([0]))
+    start = SetState(version=0, order_version=0, size=1, selected=np.array([0]))
     for v0, grew, ids in (("network", True, [2, 4]), ("zero", False, [3])):
         central = Central(config_with(f"{{kind: space, eta: 0.125, v0: {v0}}}"), make_set(4))
         *_, values = central.begin(first[:3], first[3:])
         assert values.tolist() == (first.tolist() if v0 == "network" else [0.0] * 4)
-        new, selection, numbers, after = central.decide(start, values, 0, 1, 1, second)
+        new, selection, numbers, after = central.decide(start, values, 0, 1, {"after": 1}, second)
         assert (numbers["grew"], selection.ids.tolist(), after.tolist()) == (grew, ids, second.tolist())
         # Rescored under new scales, the values before are new ones; zeros stay zeros.
-        _, selection, numbers, _ = central.decide(start, values, 0, 1, 1, second, first + 0.25)
+        _, selection, numbers, _ = central.decide(
+            start, values, 0, 1, {"after": 1, "rescored": 1}, second, first + 0.25
+        )
         assert numbers["mean_value_before"] == (8.25 if v0 == "network" else 0)
-        _, _, numbers, _ = central.decide(new, after, 1, 1, 1, second, np.array([1.0, 2.0, 3.0, 4.0]))
+        _, _, numbers, _ = central.decide(
+            new, after, 1, 1, {"after": 1, "rescored": 1}, second, np.array([1.0, 2.0, 3.0, 4.0])
+        )
         assert numbers["mean_value_before"] == np.mean([(1.0, 2.0, 3.0, 4.0)[i - 1] for i in ids])
 
 
@@ -322,7 +326,7 @@ def test_trace_cspace_on_a_schedule():
     # Euclidean: from (0, 0), (3, 4) / 8 is 0.625 away, though by the sum of its sides 0.875.
     sides = np.array([(0.0, 0.0), (0.375, 0.5), (0.75, 0.0), (1.0, 1.0)])
     for rank in (variants.near_centroid(sides), variants.near_member(sides)):
-        scores = rank(feedback(State(0, 0, 1, np.array([0])), [0] * 4, [0] * 4), np.arange(4) == 0)
+        scores = rank(feedback(SetState(0, 0, 1, np.array([0])), [0] * 4, [0] * 4), np.arange(4) == 0)
         assert scores[1:].tolist() == [-0.625, -0.75, -np.sqrt(2)]
     assert all(numbers["eta"] is None for *_, numbers, _ in decided)
     nothing = [[float("nan")] * 4] * 6
@@ -370,7 +374,7 @@ def test_the_nearest_member_never_drops_one_even_for_a_twin(contexts: list[tuple
 
 def test_the_nearest_member_in_pieces_is_the_same(monkeypatch: pytest.MonkeyPatch):
     scaled, trained = np.random.default_rng(0).uniform(-1, 1, size=(50, 3)), np.arange(50) % 5 == 0
-    told = feedback(State(0, 0, 10, np.flatnonzero(trained)), np.zeros(50), np.zeros(50))
+    told = feedback(SetState(0, 0, 10, np.flatnonzero(trained)), np.zeros(50), np.zeros(50))
     whole = variants.near_member(scaled)(told, trained)
     monkeypatch.setattr(variants, "_CHUNK_NUMBERS", 70)
     assert np.array_equal(variants.near_member(scaled)(told, trained), whole)

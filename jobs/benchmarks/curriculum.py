@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from pathlib import Path
@@ -16,7 +15,8 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import duration, median, median_cpu
 from space_dist import config as configs
-from space_dist.cluster import Central, InProcess
+from space_dist.cluster import Central, Evidence, InProcess
+from space_dist.curricula import SetState
 from space_dist.instances import sample
 from space_dist.launch import private_ray
 from space_dist.rollout import Walk
@@ -37,7 +37,7 @@ def curriculum(
     threadpool_limits(limits=1)
     private_ray()
     base = configs.load(ROOT / "configs/pointmass_space.yaml", ["tracking.uri=null"])
-    update = _ppo_update_seconds(base, repeats)
+    update = ppo_update_seconds(base, repeats)
     console.print(f"one stock PPO update (2,048 steps, minibatch 64, 10 epochs): {update:.3f} s of CPU time")
     table = Table(title="SPaCE's own cost per iteration (median CPU time, one thread)")
     for column in ("instances", "revalue", "select", "both", "share of an update", "at most", "transport on Ray"):
@@ -67,7 +67,8 @@ def curriculum(
         raise typer.Exit(1)
 
 
-def _ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
+def ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
+    """CPU seconds of one stock PPO update on PointMass: the median of `repeats`."""
     train, test = sample("pointmass_uniform", 100, 100, 0)
     setup = make_setup(config, train, test)
     cluster, learner = InProcess(config, setup), learner_of(config)
@@ -83,12 +84,12 @@ def _curriculum_row(config: configs.RunConfig, n_instances: int, repeats: int) -
     cluster, central = InProcess(config, setup), Central(config, train)
     weights = learner_of(config).policy(0)
     chunks = cluster.start_values(weights)  # the first time, start observations are made and cached
-    state, _, _, before = central.begin(*chunks)
-    everything = dataclasses.replace(state, size=n_instances, selected=np.arange(n_instances))
+    before = central.begin(*chunks)[3]
+    everything = SetState(version=0, order_version=0, size=n_instances, selected=np.arange(n_instances))
     noise = np.random.default_rng(0).standard_normal(n_instances)
     changed = np.array_split(before + noise, len(chunks))
     revalue = median_cpu(lambda: cluster.start_values(weights), repeats)
-    select = median_cpu(lambda: central.decide(everything, before, 0, 1, len(changed), *changed), repeats)
+    select = median_cpu(lambda: central.decide(everything, before, 0, 1, {"after": len(changed)}, *changed), repeats)
     return {
         "instances": n_instances, "revalue": revalue, "select": select,
         "transport": max(0.0, _through_ray(config, setup, everything, before, repeats) - revalue - select),
@@ -106,7 +107,7 @@ def _through_ray(config: configs.RunConfig, setup: Any, state: Any, before: Any,
 
         def decide() -> None:
             values = cluster.start_values(cluster.put(weights))
-            decision = cluster.decide(state_handle, before_handle, values, version=0, gradient_steps=1)
+            decision = cluster.decide(state_handle, before_handle, Evidence(values), version=0, gradient_steps=1)
             cluster.get([decision.numbers])
 
         decide()

@@ -50,13 +50,17 @@ def instances_check(
     files: Annotated[list[Path], typer.Argument(help="CSV files; given two, they must not share a context.")],
     env: Annotated[str, typer.Option(help="The environment whose contexts these are.")] = "space_dist/PointMass-v0",
     kwarg: Kwargs = None,
+    columns: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--column", help="A further column that may be there, such as a manual order. Repeatable."),
+    ] = None,
 ) -> None:
     """Check instance files and show what is in them."""
     from space_dist.envs import make_batched
     from space_dist.instances import read_csv, refuse_overlap, summary
 
     bounds = make_batched(env, 1, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
-    sets = [read_csv(file, bounds) for file in files]
+    sets = [read_csv(file, bounds, columns or (), if_there=True) for file in files]
     for index, one in enumerate(sets):
         for other in range(index):
             refuse_overlap(sets[other], one, str(files[other]), str(files[index]))

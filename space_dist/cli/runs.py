@@ -84,7 +84,7 @@ def evaluate(
     status = ledger.status()
     config = stored_config(ledger)
     policy = policy_of(ledger)
-    chosen = read_csv(instances, make_env(config).context_bounds)
+    chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
     env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     outcome = evaluate_policy(env, policy, chosen.contexts, seeds, gamma=config.learner.gamma)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import abc
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +15,65 @@ from space_dist.instances import InstanceSet
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 Numbers = dict[str, float | int | bool | None]
+
+GENERATED = -1  # the id, and the index, of a context that is not of the instance set
 
 
 @dataclass(frozen=True)
 class Selection:
     """What to train on until the next decision.
 
-    ids: (k,) instance ids in the order in which they are walked.
+    ids: (k,) instance ids in the order in which they are walked; GENERATED for contexts that are no instance's.
     contexts: (k, d) their contexts in environment units.
     version: counts decisions; whatever was computed for another version is refused.
     order_version: the version at which ids last changed; while it stays, the walk goes on where it stopped.
+    drawn: whether these are draws, at least one for each episode that a round can hold, instead of a set to be passed
+        over: an iteration is one round then, and what counts as trained on are the draws that became episodes.
     """
 
     version: int
     ids: IntArray
     contexts: FloatArray
     order_version: int
+    drawn: bool = False
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The m training episodes of one iteration, round after round, shard after shard.
+
+    indices: (m,) into the instance set, GENERATED for generated contexts.  contexts: (m, d) in environment units.
+    returns, discounted_returns: (m,) in reward units; of a cut episode, as far as it got.
+    lengths: (m,) in steps.  success: (m,) 1 or 0, NaN where the environment knows no success.
+    finished: (m,) false where the end of a round cut the episode.
+    start_values: (m,) V(s0, c) behind the iteration's updates, in reward units.
+    advantages: (m,) mean |GAE| over the episode's steps, in reward units; NaN for learners without advantages.
+    """
+
+    indices: IntArray
+    contexts: FloatArray
+    returns: FloatArray
+    discounted_returns: FloatArray
+    lengths: IntArray
+    success: FloatArray
+    finished: BoolArray
+    start_values: FloatArray
+    advantages: FloatArray
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Episodes that were run only to learn how hard instances are; their steps count in the budget.
+
+    indices: (k,) into the instance set.  returns: (k,) in reward units.  lengths: (k,) in steps.  success: (k,).
+    """
+
+    indices: IntArray
+    returns: FloatArray
+    lengths: IntArray
+    success: FloatArray
 
 
 @dataclass(frozen=True)
@@ -39,19 +84,50 @@ class Feedback:
     values_before, values_after: (n,) start values V(s0, c_i) of *all* instances, in id order, before and after the
         iteration's updates, in reward units.
     gradient_steps: how many the iteration made on the network that is scored.
+    episodes: the iteration's, if `Wants.episodes`.
+    members: (n, members) start values of all instances by each member of an ensemble, if `Wants.ensemble`.
+    probes: of the instances that `Curriculum.probes` named; None where it named none, or the budget had no room.
     """
 
     version: int
     values_before: FloatArray
     values_after: FloatArray
     gradient_steps: int
+    episodes: Episodes | None = None
+    members: FloatArray | None = None
+    probes: Probes | None = None
+
+
+@dataclass(frozen=True)
+class Wants:
+    """What a curriculum asks of its feedback, beside the start values of all instances.
+
+    episodes: `Feedback.episodes`.
+    advantages: `Episodes.advantages`, which only learners with advantages have.
+    ensemble: an ensemble of value functions, trained on the rollouts, and its `Feedback.members`.
+    """
+
+    episodes: bool = False
+    advantages: bool = False
+    ensemble: bool = False
 
 
 @dataclass(frozen=True)
 class State:
     """A curriculum's memory: plain numbers and arrays, so that it can be stored and moved anywhere.
 
-    version, order_version: of the last selection.
+    Every curriculum adds its own fields: int, float, bool, None, or NumPy arrays.
+    version: of the last selection.
+    """
+
+    version: int
+
+
+@dataclass(frozen=True)
+class SetState(State):
+    """The memory of a curriculum that trains on a set of instances.
+
+    order_version: the version at which `selected` last changed.
     size: S, the number of instances selected.
     selected: (size,) indices into the instance set, in walking order.
     tests, growths, stalled: how often growth was tested, how often it was granted, and the tests since it last was.
@@ -59,7 +135,6 @@ class State:
     eta: the growth threshold in force, where it is adapted for good; None where it is the configured one.
     """
 
-    version: int
     order_version: int
     size: int
     selected: IntArray
@@ -70,7 +145,23 @@ class State:
     eta: float | None = None
 
 
-def selection_of(instances: InstanceSet, state: State) -> Selection:
+AnyState = TypeVar("AnyState", bound=State)
+
+
+def encode_state(state: State) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """A state as arrays and JSON data, by field."""
+    fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    arrays = {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+    return arrays, {name: value for name, value in fields.items() if name not in arrays}
+
+
+def decode_state(kind: type[AnyState], arrays: Mapping[str, NDArray[Any]], numbers: Mapping[str, Any]) -> AnyState:
+    """The inverse of `encode_state`."""
+    fields: dict[str, Any] = {**arrays, **numbers}
+    return kind(**fields)
+
+
+def selection_of(instances: InstanceSet, state: SetState) -> Selection:
     """The instances that a state has selected, in its order."""
     return Selection(
         version=state.version,
@@ -80,14 +171,27 @@ def selection_of(instances: InstanceSet, state: State) -> Selection:
     )
 
 
-class Curriculum(Protocol):
+class Curriculum(abc.ABC):
     """Chooses what to train on next. Implementations hold the instance set and constants only, never a state."""
 
+    state_type: ClassVar[type[State]]
+    wants: ClassVar[Wants] = Wants()
+
+    @abc.abstractmethod
     def start(self) -> tuple[State, Selection]:
         """The first selection, before anything was observed."""
 
-    def step(self, state: State, feedback: Feedback) -> tuple[State, Selection, Numbers]:
-        """The next state and selection, and numbers for the log. Pure: same arguments, same answer."""
+    @abc.abstractmethod
+    def step(self, state: Any, feedback: Feedback) -> tuple[State, Selection, Numbers]:
+        """The next state and selection, and numbers for the log. Pure: same arguments, same answer.
 
-    def selection(self, state: State) -> Selection:
+        state: a `state_type`.
+        """
+
+    @abc.abstractmethod
+    def selection(self, state: Any) -> Selection:
         """The selection that belongs to a state."""
+
+    def probes(self, version: int) -> IntArray | None:  # noqa: ARG002 - most ask for none
+        """`(k,)` indices of instances, one for each episode that the feedback on selection `version` shall probe."""
+        return None

@@ -11,16 +11,26 @@ import dataclasses
 
 import numpy as np
 
-from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, State, selection_of
+from space_dist.curricula.interface import (
+    Curriculum,
+    Feedback,
+    FloatArray,
+    IntArray,
+    Numbers,
+    Selection,
+    SetState,
+    selection_of,
+)
 from space_dist.curricula.variants import AdaptiveEta, Growth, Mean, Members, Rank, grown, improvement, readings
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, UInt64Array, instance_keys
 
 
-class Space:
+class Space(Curriculum):
     """The instances whose start value rose most, from a set that grows whenever values settle.
 
     seed: decides the first instance and ties.
+    first: (n,) scores of which the highest decides the first instance instead; None: the seed.
     eta: growth threshold: the relative change of the mean start value below which the set grows (paper: eta).
     kappa: how many instances a growth adds (paper: kappa).
     rank: what line 12 ranks by (paper: d_t(i)).
@@ -30,6 +40,8 @@ class Space:
         with an eta that lets the set grow; `persistent` never lowers it again.
     """
 
+    state_type = SetState
+
     def __init__(
         self,
         instances: InstanceSet,
@@ -38,6 +50,7 @@ class Space:
         eta: float,
         kappa: int,
         rank: Rank = improvement,
+        first: FloatArray | None = None,
         mean: Mean = "same_set",
         growth: Growth = "add",
         adaptive_eta: AdaptiveEta = "off",
@@ -48,13 +61,14 @@ class Space:
         self._rank, self._mean, self._growth = rank, mean, growth
         self._adaptive_eta, self._patience, self._epsilon = adaptive_eta, patience, epsilon
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
+        self._first = np.argsort(self._ties)[:1] if first is None else _highest(first, 1, self._ties)
 
-    def start(self) -> tuple[State, Selection]:
+    def start(self) -> tuple[SetState, Selection]:
         """Lines 1-3: one instance, chosen by the seed. Line 1's S := 0 would empty the set: S starts at 1."""
-        state = State(version=0, order_version=0, size=1, selected=np.argsort(self._ties)[:1])
+        state = SetState(version=0, order_version=0, size=1, selected=self._first)
         return state, self.selection(state)
 
-    def step(self, state: State, feedback: Feedback) -> tuple[State, Selection, Numbers]:
+    def step(self, state: SetState, feedback: Feedback) -> tuple[SetState, Selection, Numbers]:
         """Lines 6-13: compare values on the set just trained on, maybe grow, and select by PIC."""
         n, trained = len(self._instances), self._membership(state.selected)
         before, after = feedback.values_before[trained], feedback.values_after[trained]
@@ -122,7 +136,7 @@ class Space:
         members[indices] = True
         return members
 
-    def selection(self, state: State) -> Selection:
+    def selection(self, state: SetState) -> Selection:
         """The instances a state has selected."""
         return selection_of(self._instances, state)
 

@@ -88,6 +88,16 @@ def near_member(scaled: FloatArray) -> Rank:
     return rank
 
 
+def in_order(scores: FloatArray) -> Rank:
+    """A manual order: (n,) scores that never change."""
+    return lambda feedback, trained: scores
+
+
+def directed(rank: Rank, reverse: bool) -> Rank:
+    """`rank`, or its reverse: a control."""
+    return (lambda feedback, trained: -rank(feedback, trained)) if reverse else rank
+
+
 # ---- Lines 6-7: has V_t settled? -----------------------------------------------------------------
 
 

@@ -6,12 +6,25 @@ from it. What SB3 does outside `train()` while it collects is done here, per tra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from gymnasium import spaces
 
-from space_dist.config import A2CConfig, DQNConfig, LearnerConfig, PPOConfig, SACConfig, TD3Config, TRPOConfig
+from space_dist.config import (
+    A2CConfig,
+    DQNConfig,
+    LearnerConfig,
+    PPOConfig,
+    RunConfig,
+    SACConfig,
+    TD3Config,
+    TRPOConfig,
+    ValueDisagreementConfig,
+)
+from space_dist.errors import ConfigError
+from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
@@ -48,12 +61,28 @@ def preload() -> None:
     torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
 
 
+def make_ensemble(config: RunConfig, observation_space: spaces.Space[Any], features: Sequence[str]) -> Ensemble | None:
+    """The ensemble of value functions that a config's curriculum asks for, if it does.
+
+    features: of the context, which observations end with where `env.context_visible`.
+    Raises ConfigError if it cannot work with these observations.
+    """
+    if not isinstance(config.curriculum, ValueDisagreementConfig):
+        return None
+    if config.curriculum.members_see is not None and not config.env.context_visible:
+        raise ConfigError("curriculum.members_see: observations hold no context with env.context_visible: false")
+    torch.set_num_threads(1)
+    return Ensemble(config.curriculum, config.learner, observation_space, features, seed=config.seed)
+
+
 __all__ = [
     "Arrays",
+    "Ensemble",
     "Learner",
     "OffPolicyLearner",
     "OnPolicyLearner",
     "Update",
+    "make_ensemble",
     "make_learner",
     "preload",
     "refuse_spaces",

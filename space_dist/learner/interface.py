@@ -28,10 +28,15 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Update:
-    """What one update reported: SB3's own training metrics, and how many optimiser steps the scored network took."""
+    """What one update reported: SB3's own training metrics, and how many optimiser steps the scored network took.
+
+    advantages: (m,) mean |GAE| of each of the round's episodes, shard after shard, in reward units; None for learners
+        without advantages.
+    """
 
     metrics: dict[str, float]
     gradient_steps: int
+    advantages: NDArray[np.float64] | None = None
 
 
 class Learner(abc.ABC):
@@ -52,6 +57,7 @@ class Learner(abc.ABC):
         total_steps: int,
     ) -> None:
         self._config, self._seed, self._total_steps = config, seed, total_steps
+        self._episode_advantages: NDArray[np.float64] | None = None  # of the last update
         refuse_spaces(config, observation_space, action_space)
         self._normaliser = (
             Normaliser(observation_space, config.gamma, config.normalize_observations, config.normalize_rewards)
@@ -136,7 +142,9 @@ class Learner(abc.ABC):
             if isinstance(value, int | float | np.number) and np.isfinite(value)
         }
         recorded.clear()
-        return Update({**metrics, **self._more_metrics(metrics)}, self._gradient_steps() - before)
+        return Update(
+            {**metrics, **self._more_metrics(metrics)}, self._gradient_steps() - before, self._episode_advantages
+        )
 
     def _more_metrics(self, metrics: Mapping[str, float]) -> dict[str, float]:  # noqa: ARG002 - SAC's needs them
         return {"reward_std": self.statistics.reward_std} if self.statistics.reward_std != 1.0 else {}

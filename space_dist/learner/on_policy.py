@@ -87,7 +87,8 @@ class OnPolicyLearner(Learner):
         )
 
     def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
-        self.fill(shards)
+        advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
+        self._episode_advantages = mean_sizes(shards, advantages) * self.statistics.reward_std
         self.model.num_timesteps = steps
         self.model._update_current_progress_remaining(steps, self._total_steps)
         self.model.train()
@@ -135,3 +136,17 @@ class OnPolicyLearner(Learner):
         scaled = self.statistics.scaled(observations)
         values: NDArray[np.float32] = self.model.policy.predict_values(tensors(scaled)).numpy()
         return values
+
+
+def mean_sizes(shards: Sequence[Shard], numbers: NDArray[np.float32]) -> NDArray[np.float64]:
+    """`(episodes,)` mean absolute value over each episode of (length, slots of all shards) numbers, shard by shard."""
+    sums = np.zeros((len(numbers) + 1, numbers.shape[1]))
+    np.cumsum(np.abs(numbers), axis=0, dtype=np.float64, out=sums[1:])
+    means, first = [], 0
+    for shard in shards:
+        episodes, slots = shard.episodes, shard.episodes.slots + first
+        ends = episodes.starts + episodes.lengths
+        with np.errstate(invalid="ignore"):  # of infinite rewards: the update says that training diverged
+            means.append((sums[ends, slots] - sums[episodes.starts, slots]) / episodes.lengths)
+        first += shard.rewards.shape[1]
+    return np.concatenate(means)

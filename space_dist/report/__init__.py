@@ -9,7 +9,7 @@ from pathlib import Path
 from space_dist.errors import ConfigError
 from space_dist.ledger import Ledger, atomic_write
 from space_dist.report.document import Document, Picture, Section, to_markdown
-from space_dist.report.figures import draw_comparison, draw_curriculum, draw_learning_curve, png, save
+from space_dist.report.figures import draw_comparison, draw_contexts, draw_curriculum, draw_learning_curve, png, save
 from space_dist.report.grid_report import GridReport, build_grid_report
 from space_dist.report.load import Configuration, Run, group, load_run, read_config
 from space_dist.report.statistics import RESAMPLES, Estimate, Interval, bootstrap_interval, estimate, interquartile_mean
@@ -27,6 +27,7 @@ __all__ = [
     "build_grid_report",
     "build_report",
     "draw_comparison",
+    "draw_contexts",
     "draw_curriculum",
     "draw_learning_curve",
     "estimate",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from space_dist.errors import ConfigError, LedgerError
+from space_dist.errors import LedgerError
 from space_dist.ledger import atomic_write
 from space_dist.report.load import Configuration, FloatArray, IntArray, Run
 from space_dist.report.statistics import bootstrap_interval, interquartile_mean
@@ -206,16 +206,16 @@ def curriculum_shares(
 
 
 def draw_curriculum(run: Run) -> Figure:
-    """A heat map: which instances (rows) the run was trained on in which iteration (columns).
+    """What the run was trained on: a heat map of instances (rows) by iterations (columns).
 
-    Raises LedgerError if there is no iteration yet, ConfigError if the curriculum generates its contexts: then there
-    are no instances to show.
+    Where contexts were generated there are no instances to show, and it is `draw_contexts`. Raises LedgerError if there
+    is no iteration yet.
     """
-    if run.generates_contexts:
-        raise ConfigError(f"{run.ledger.folder} was trained on generated contexts: it has no map of instances")
     trained = run.trained
     if not trained:
         raise LedgerError(f"{run.ledger.folder} holds no iteration yet")
+    if run.generates_contexts:
+        return draw_contexts(run)
     order, shares = curriculum_shares(trained, run.instance_ids)
     n, m = len(order), len(trained)
     height, width = -(-n // MAX_ROWS), -(-m // MAX_COLUMNS)
@@ -239,6 +239,44 @@ def draw_curriculum(run: Run) -> Figure:
         axes.set_ylabel("instance, in order of first inclusion")
     if height > 1 or width > 1:
         figure.colorbar(image, ax=axes, label=f"share of {height} instances × {width} iterations trained on")
+    return figure
+
+
+def draw_contexts(run: Run) -> Figure:
+    """Generated contexts over real environment steps: mean and standard deviation of each feature in each iteration.
+
+    With the target's, and the divergence from it, where the curriculum logged them. Raises LedgerError if no context
+    was generated, or not in every iteration.
+    """
+    generated, features, decisions = run.contexts, run.features, run.decisions
+    if not generated or len(generated) != len(run.set_sizes):
+        raise LedgerError(f"{run.ledger.folder} was not trained on generated contexts in every iteration")
+    names = features[: generated[0].shape[1]]
+    divergences = [(steps, numbers["kl_to_target"]) for steps, numbers in decisions if "kl_to_target" in numbers]
+    panels = len(names) + bool(divergences)
+    columns = 2 if panels <= 4 else 4
+    rows = -(-panels // columns)
+    figure = _figure(4.6 * columns, 3.0 * rows)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    means = np.array([contexts.mean(axis=0) for contexts in generated])
+    deviations = np.array([contexts.std(axis=0) for contexts in generated])
+    last: Mapping[str, Any] = decisions[-1][1] if decisions else {}
+    for place, name in enumerate(names):
+        mean, deviation, panel = means[:, place], deviations[:, place], axes[place]
+        panel.fill_between(run.iteration_ends, mean - deviation, mean + deviation, color=COLOURS[0], alpha=0.2, lw=0)
+        panel.plot(run.iteration_ends, mean, color=COLOURS[0], label="trained on: mean ± standard deviation")
+        if f"target_mean_{name}" in last:
+            centre, spread = last[f"target_mean_{name}"], last[f"target_std_{name}"]
+            panel.axhspan(centre - spread, centre + spread, color=COLOURS[1], alpha=0.25, lw=0)
+            panel.axhline(centre, color=COLOURS[1], linestyle="--", label="target: mean ± standard deviation")
+        _dress(panel, "", name)
+    if divergences:
+        axes[len(names)].semilogy(*zip(*divergences, strict=True), color=COLOURS[2])
+        _dress(axes[len(names)], "", "KL to the target (nats)")
+    for empty in axes[panels:]:
+        empty.set_axis_off()
+    figure.suptitle(f"{run.status.name}, seed {run.status.seed}: generated contexts", fontsize=11)
+    figure.legend(handles=axes[0].get_lines(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 

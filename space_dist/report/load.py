@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -64,6 +65,25 @@ class Run:
     def trained(self) -> tuple[IntArray, ...]:
         """The m arrays of ids that were trained on, in order; read anew, for those of many runs fill the memory."""
         return _trained(self.ledger, _rows(self.ledger, CURRICULUM))
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Of a context, in the order of the instance files."""
+        return tuple(name for name in _header(self.ledger) if name != "id")
+
+    @property
+    def contexts(self) -> tuple[FloatArray, ...]:
+        """`(k, d)` contexts of each iteration whose contexts were generated, in environment units; read anew."""
+        with _readable(self.ledger):
+            rows = _rows(self.ledger, CURRICULUM)
+            return tuple(np.array(row["contexts"], dtype=np.float64) for row in rows if "contexts" in row)
+
+    @property
+    def decisions(self) -> tuple[tuple[int, Mapping[str, Any]], ...]:
+        """The steps of the complete iterations and what the curriculum logged at their end; read anew."""
+        with _readable(self.ledger):
+            return tuple((int(row["steps"]), dict(row["curriculum"])) for row in _rows(self.ledger, METRICS)
+                         if row.get("kind") == "iteration" and row["curriculum"])  # fmt: skip
 
     def final(self, split: Split, measure: str) -> float:
         """The last evaluation's mean over the split. Raises LedgerError if nothing was evaluated yet."""
@@ -148,31 +168,36 @@ def load_run(ledger: Ledger, config: Mapping[str, Any] | None = None) -> Run:
     instance_ids = _instance_ids(ledger)
     evaluations = [row for row in _rows(ledger, METRICS) if row.get("kind") == "evaluation"]
     iterations = _rows(ledger, CURRICULUM)
-    try:
+    with _readable(ledger):
         steps = np.array([int(row["steps"]) for row in evaluations], dtype=np.int64)
         train, test = ({measure: _column(evaluations, split, measure) for measure in MEASURES}
                        for split in ("train", "test"))  # fmt: skip
         ends = np.array([int(row["steps"]) for row in iterations], dtype=np.int64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise _unreadable(ledger, error) from None
     trained = _trained(ledger, iterations)
     return Run(
         ledger, config, status, instance_ids, steps, train, test, ends,
-        set_sizes=np.array([len(ids) for ids in trained], dtype=np.int64),
+        set_sizes=np.array([_size(ids) for ids in trained], dtype=np.int64),
         generates_contexts=any(bool((ids < 0).any()) for ids in trained),
         all_instances_reached_at=_all_reached_at(instance_ids, _starts(ends), trained),
     )  # fmt: skip
 
 
 def _trained(ledger: Ledger, iterations: Sequence[Row]) -> tuple[IntArray, ...]:
-    try:
+    with _readable(ledger):
         return tuple(np.array(row["trained"], dtype=np.int64) for row in iterations)
+
+
+def _size(ids: IntArray) -> int:
+    """Distinct instances; generated contexts, whose id is -1, count each."""
+    return len(ids) if (ids < 0).any() else len(np.unique(ids))
+
+
+@contextlib.contextmanager
+def _readable(ledger: Ledger) -> Iterator[None]:
+    try:
+        yield
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise _unreadable(ledger, error) from None
-
-
-def _unreadable(ledger: Ledger, error: Exception) -> LedgerError:
-    return LedgerError(f"{ledger.folder} has rows that this version cannot read: {error!r}")
+        raise LedgerError(f"{ledger.folder} has rows that this version cannot read: {error!r}") from None
 
 
 def _starts(ends: IntArray) -> IntArray:
@@ -257,6 +282,11 @@ def _ids_of(text: str) -> IntArray | None:
         return np.array(sorted(int(line.split(",")[column]) for line in lines if line.strip()), dtype=np.int64)
     except (ValueError, IndexError, OverflowError):
         return None
+
+
+def _header(ledger: Ledger) -> list[str]:
+    """The columns of the training instances."""
+    return [name.strip() for name in _read_instances(ledger, "train").partition("\n")[0].split(",")]
 
 
 def _rows(ledger: Ledger, name: str) -> list[Row]:

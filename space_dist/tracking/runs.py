@@ -491,7 +491,7 @@ def _draw(ledger: Ledger, folder: Path, *, episodes: bool) -> list[Path]:
     figures = {}
     if len(run.evaluation_steps):
         figures["learning_curve.png"] = draw_learning_curve(run)
-    if len(run.set_sizes) and not run.generates_contexts:
+    if len(run.set_sizes):
         figures["curriculum.png"] = draw_curriculum(run)
     for name, figure in figures.items():
         save(figure, folder / name)

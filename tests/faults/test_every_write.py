@@ -24,12 +24,12 @@ from tests.test_learners import ROUNDS, config_for, crashed, learner_section, re
 ROOT = Path(__file__).resolve().parent.parent.parent
 LEARNERS = ("ppo", "trpo", "dqn", "sac")
 ALL = bool(os.environ.get("SPACE_DIST_ALL_FAULTS"))  # else each learner meets a quarter of the refusals, together all
-SHORT = 3  # rounds of the runs whose every write is hit
+SHORT = 2  # rounds of the runs whose every write is hit
 
 
 def short(folder: Path, learner: str, rounds: int = SHORT) -> configs.RunConfig:
     section = learner_section(learner, n_steps=32, net_arch=[4])
-    section |= {"learning_starts": 20, "batch_size": 8, "buffer_size": 75} if learner in ("dqn", "sac") else {}
+    section |= {"learning_starts": 20, "batch_size": 8, "buffer_size": 50} if learner in ("dqn", "sac") else {}
     return config_for(folder, section, budget={"steps": 32 * rounds}, rollout={"shards": 2, "slots": 2})
 
 
@@ -52,8 +52,8 @@ def test_a_run_killed_at_any_write_is_resumed_to_the_same_bytes(learner: str, tm
     with Disk(tmp_path / "run", kills).watched() as disk:
         launch(config, tmp_path / "run", resume=True, stop=StopRequests())
     reference = results(tmp_path / "run")
-    assert disk.calls > 150
-    assert len(kills.moments) > 60
+    assert disk.calls > 100
+    assert len(kills.moments) > 40
     rounds = set()
     for what, folder in kills.moments:
         names = sorted((folder / "checkpoints").glob("round-*.npz"))

@@ -1,0 +1,208 @@
+"""From a config's section to its curriculum. Apart from the algorithms, which know no config."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from space_dist.config import (
+    AlpGmmConfig,
+    ContextSpaceConfig,
+    CurriculumConfig,
+    FixedConfig,
+    LearnabilityConfig,
+    LevelReplayConfig,
+    ManualConfig,
+    RandomGrowthConfig,
+    RoundRobinConfig,
+    SelfPacedConfig,
+    SpaceConfig,
+    UniformConfig,
+    ValueDisagreementConfig,
+)
+from space_dist.curricula import variants
+from space_dist.curricula.alp_gmm import AlpGmm
+from space_dist.curricula.draws import Draws, Uniform
+from space_dist.curricula.gaussian import Gaussian
+from space_dist.curricula.interface import Curriculum, FloatArray
+from space_dist.curricula.learnability import Learnability
+from space_dist.curricula.plr import LevelReplay
+from space_dist.curricula.round_robin import RoundRobin
+from space_dist.curricula.space import Space
+from space_dist.curricula.spdrl import SelfPaced
+from space_dist.curricula.vds import ValueDisagreement
+from space_dist.errors import ConfigError, nearest
+from space_dist.instances import ContextBounds, InstanceSet
+
+
+class Makers:
+    """Makes one run's curriculum.
+
+    train: the instance set, and `source` the file it came from.
+    draws: how many a round can use.
+    bounds: asks the environment for the bounds of its contexts; only called by those that need them.
+    """
+
+    def __init__(
+        self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: Callable[[], ContextBounds]
+    ) -> None:
+        self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
+
+    def make(self, settings: CurriculumConfig) -> Curriculum:
+        """The curriculum. Raises ConfigError if it asks for what the instances or the environment do not have."""
+        makers: Mapping[type, Callable[[Any], Curriculum]] = {
+            SpaceConfig: self._space,
+            RandomGrowthConfig: self._random_growth,
+            ContextSpaceConfig: self._context_space,
+            ManualConfig: self._manual,
+            RoundRobinConfig: lambda _: RoundRobin(self._train, seed=self._seed),
+            FixedConfig: self._fixed,
+            UniformConfig: lambda _: Uniform(self._train, seed=self._seed, draws=self._draws),
+            SelfPacedConfig: self._self_paced,
+            ValueDisagreementConfig: self._value_disagreement,
+            AlpGmmConfig: self._alp_gmm,
+            LevelReplayConfig: self._level_replay,
+            LearnabilityConfig: self._learnability,
+        }
+        return makers[type(settings)](settings)
+
+    # ---- sets that grow ----
+
+    def _growing(self, settings: SpaceConfig | RandomGrowthConfig | ContextSpaceConfig | ManualConfig,
+                 rank: variants.Rank, first: FloatArray | None = None) -> Space:  # fmt: skip
+        return Space(
+            self._train, seed=self._seed, eta=settings.eta, kappa=settings.kappa, rank=rank, first=first,
+            mean=settings.mean, growth=settings.growth, adaptive_eta=settings.adaptive_eta,
+            patience=settings.patience, epsilon=settings.epsilon,
+        )  # fmt: skip
+
+    def _space(self, settings: SpaceConfig) -> Space:
+        if settings.pic == "random":
+            return self._growing(settings, variants.at_random(self._train, seed=self._seed))
+        return self._growing(settings, variants.directed(variants.BY_VALUE[settings.pic], settings.reverse))
+
+    def _random_growth(self, settings: RandomGrowthConfig) -> Space:
+        return self._growing(settings, variants.at_random(self._train, seed=self._seed))
+
+    def _context_space(self, settings: ContextSpaceConfig) -> Space:
+        by_distance = {"centroid": variants.near_centroid, "nearest_member": variants.near_member}
+        rank = by_distance[settings.distance](self._bounds().scale(self._train.contexts))
+        return self._growing(settings, variants.directed(rank, settings.reverse))
+
+    def _manual(self, settings: ManualConfig) -> Space:
+        columns = self._train.columns
+        if settings.column not in columns:
+            raise ConfigError(
+                f"curriculum.column: {self._source} was read without a column {settings.column!r}"
+                f"{nearest(settings.column, columns)}"
+            )
+        scores = columns[settings.column] if settings.reverse else -columns[settings.column]
+        return self._growing(settings, variants.in_order(scores), first=scores)
+
+    # ---- fixed sets ----
+
+    def _fixed(self, settings: FixedConfig) -> RoundRobin:
+        ids = self._train.ids.tolist()
+        holds = f"{self._source} holds {len(ids)} instances, with ids from {ids[0]} to {ids[-1]}"
+        if settings.count is not None and settings.count > len(ids):
+            raise ConfigError(f"curriculum.count: {settings.count} is too many: {holds}")
+        missing = sorted(set(settings.ids or ()).difference(ids))
+        if missing:
+            more = f" (nor {len(missing) - 1} more of these)" if len(missing) > 1 else ""
+            closest = min(ids, key=lambda one: abs(one - missing[0]))
+            raise ConfigError(
+                f"curriculum.ids: there is no instance {missing[0]}{more}; the nearest is {closest}. {holds}"
+            )
+        return RoundRobin(self._train, seed=self._seed, ids=settings.ids, count=settings.count)
+
+    # ---- draws ----
+
+    def _value_disagreement(self, settings: ValueDisagreementConfig) -> ValueDisagreement:
+        names = self._train.names
+        for name in settings.members_see or ():
+            if name not in names:
+                raise ConfigError(
+                    f"curriculum.members_see: contexts have no feature {name!r}{nearest(name, names)} "
+                    f"Allowed: {', '.join(names)}"
+                )
+        return ValueDisagreement(self._train, seed=self._seed, draws=self._draws)
+
+    def _alp_gmm(self, settings: AlpGmmConfig) -> AlpGmm:
+        return AlpGmm(
+            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds(), from_set=settings.over == "set",
+            random_share=settings.random_share, fit_rate=settings.fit_rate, history=settings.history,
+            components=settings.components,
+        )  # fmt: skip
+
+    def _level_replay(self, settings: LevelReplayConfig) -> LevelReplay:
+        return LevelReplay(
+            self._train, seed=self._seed, draws=self._draws, temperature=settings.temperature,
+            staleness_share=settings.staleness_share,
+        )  # fmt: skip
+
+    def _learnability(self, settings: LearnabilityConfig) -> Learnability:
+        n = len(self._train)
+        for name, value in (("top", settings.top), ("candidates", settings.candidates)):
+            if value is not None and value > n:
+                raise ConfigError(f"curriculum.{name}: {value} is too many: {self._source} holds {n} instances")
+        return Learnability(
+            self._train, seed=self._seed, draws=self._draws, top=settings.top, uniform_share=settings.uniform_share,
+            every=settings.every, candidates=settings.candidates, episodes=settings.episodes,
+        )  # fmt: skip
+
+    def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
+        bounds = self._bounds()
+        middle, width = (bounds.low + bounds.high) / 2.0, bounds.high - bounds.low
+        initial = Gaussian.of(
+            self._features("initial_mean", settings.initial_mean, bounds, middle),
+            self._features("initial_std", settings.initial_std, bounds, width / 4.0),
+        )
+        if settings.target == "set_moments":
+            target = self._set_moments()
+        else:
+            target = Gaussian.of(
+                self._features("target_mean", settings.target_mean, bounds, middle),
+                self._features("target_std", settings.target_std, bounds, width),
+            )
+        least = settings.least_std
+        return SelfPaced(
+            seed=self._seed, draws=self._draws, bounds=bounds, initial=initial, target=target,
+            zeta=settings.zeta, offset=settings.offset, epsilon=settings.epsilon, warm_up=settings.warm_up,
+            optimiser=settings.optimiser, least_std_until=settings.least_std_until,
+            least_std=None if least is None else self._features("least_std", least, bounds, width),
+        )  # fmt: skip
+
+    def _set_moments(self) -> Gaussian:
+        contexts = self._train.contexts
+        covariance = np.atleast_2d(np.cov(contexts, rowvar=False, ddof=0)) if len(contexts) > 1 else None
+        try:
+            if covariance is None:
+                raise np.linalg.LinAlgError
+            return Gaussian(contexts.mean(axis=0), np.linalg.cholesky(covariance).astype(np.float64))
+        except np.linalg.LinAlgError:
+            raise ConfigError(
+                f"curriculum.target: set_moments needs instances that vary in every direction, and the {len(contexts)} "
+                f"of {self._source} do not: their covariance is singular. Use target: normal"
+            ) from None
+
+    def _features(
+        self, key: str, given: tuple[float, ...] | None, bounds: ContextBounds, default: FloatArray
+    ) -> FloatArray:
+        if given is None:
+            return default
+        if len(given) != len(bounds.names):
+            raise ConfigError(
+                f"curriculum.{key}: {len(given)} numbers for the {len(bounds.names)} features of a context "
+                f"({', '.join(bounds.names)})"
+            )
+        values = np.array(given, dtype=np.float64)
+        outside = (values < bounds.low) | (values > bounds.high)
+        if key.endswith("mean") and outside.any():
+            at = int(outside.argmax())
+            raise ConfigError(
+                f"curriculum.{key}: {bounds.names[at]} = {values[at]:g} is outside its bounds "
+                f"[{bounds.low[at]:g}, {bounds.high[at]:g}]"
+            )
+        return values

@@ -1,0 +1,248 @@
+"""Self-paced deep reinforcement learning (SPDRL; Klink et al. 2020): a normal distribution of contexts on its way.
+
+It starts where it is told to and is pulled towards a target distribution, as fast as the policy's values allow: after
+an iteration, maximise
+
+    mean_j [ p(c_j) / p_old(c_j) * V(s0, c_j) ] - alpha * KL(p || target)    subject to    KL(p_old || p) <= epsilon
+
+over the iteration's contexts c_j. Its contexts are generated, so they are of no instance set; evaluation stays on the
+instance sets of everyone. ../shared/reference/algorithm.md ("SPDRL") names what the published code does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import BFGS, Bounds, NonlinearConstraint, minimize
+from scipy.sparse.linalg import cg
+
+from space_dist.curricula.draws import Draws
+from space_dist.curricula.gaussian import Gaussian
+from space_dist.curricula.interface import (
+    GENERATED,
+    Curriculum,
+    Feedback,
+    FloatArray,
+    Numbers,
+    Selection,
+    State,
+    Wants,
+)
+from space_dist.instances import ContextBounds
+from space_dist.seeding import Purpose, generator
+
+LARGEST_ALPHA = 1e5
+SMALLEST_KL = 1e-10  # what alpha is divided by at least
+_LARGEST_LOG_RATIO = 50.0  # of densities; far outside any trust region
+_GTOL, _XTOL = 1e-4, 1e-6  # of trust-constr, as in the published code
+_CG_STEPS = 10
+_LINE_SEARCH_STEPS, _SHRINK = 20, 0.8
+
+Optimiser = Literal["trust_constr", "conjugate_gradient"]
+
+
+@dataclass(frozen=True)
+class ContextState(State):
+    """mean: (d,), factor: (d, d): the distribution that the next contexts are drawn from, as `Gaussian`.
+
+    updates: how often it was asked to move ("teacher iterations").
+    """
+
+    mean: FloatArray
+    factor: FloatArray
+    updates: int
+
+    @property
+    def distribution(self) -> Gaussian:
+        """What contexts are drawn from."""
+        return Gaussian(self.mean, self.factor)
+
+
+class Step(NamedTuple):
+    """One move of the distribution, whether it was taken, and how many iterations the optimiser made."""
+
+    distribution: Gaussian
+    accepted: bool
+    iterations: int
+
+
+class SelfPaced(Curriculum):
+    """Contexts from a normal distribution that moves from `initial` to `target`.
+
+    zeta, offset: of the schedule of alpha.
+    epsilon: the trust region, KL(p_old || p), in nats.
+    warm_up: iterations before the distribution first moves.
+    least_std, least_std_until: log diag L stays at or above log `least_std` (d,) while KL(p || target) is above
+        `least_std_until` nats; None: no such limit.
+    """
+
+    state_type = ContextState
+    wants = Wants(episodes=True)
+
+    def __init__(
+        self, *, seed: int, draws: Draws, bounds: ContextBounds, initial: Gaussian, target: Gaussian,
+        zeta: float, offset: int, epsilon: float, warm_up: int, optimiser: Optimiser,
+        least_std: FloatArray | None, least_std_until: float,
+    ) -> None:  # fmt: skip
+        self._seed, self._draws, self._bounds = seed, draws, bounds
+        self._initial, self._target = initial, target
+        self._zeta, self._offset, self._epsilon, self._warm_up = zeta, offset, epsilon, warm_up
+        self._optimiser = optimiser
+        self._least_std, self._least_std_until = least_std, least_std_until
+
+    def start(self) -> tuple[ContextState, Selection]:
+        """The initial distribution."""
+        state = ContextState(0, self._initial.mean, self._initial.factor, updates=0)
+        return state, self.selection(state)
+
+    def step(self, state: ContextState, feedback: Feedback) -> tuple[ContextState, Selection, Numbers]:
+        """Move the distribution, once the warm-up is over."""
+        episodes = feedback.episodes
+        if episodes is None:
+            raise ValueError("SPDRL needs the iteration's episodes")
+        old, updates = state.distribution, state.updates
+        performance = float(episodes.discounted_returns[episodes.finished].mean())
+        to_target = old.kl_to(self._target)
+        moved, alpha = Step(old, False, 0), None
+        if state.version >= self._warm_up:
+            updates += 1
+            alpha = weight_of_target(updates, self._offset, self._zeta, performance, to_target)
+            limit = self._least_std if to_target > self._least_std_until else None
+            move = {"trust_constr": by_trust_region, "conjugate_gradient": by_conjugate_gradient}[self._optimiser]
+            moved = move(
+                Objective(old, self._target, episodes.contexts, episodes.start_values, alpha), self._epsilon, limit
+            )
+        new = ContextState(state.version + 1, moved.distribution.mean, moved.distribution.factor, updates)
+        numbers: Numbers = {
+            "size": len(episodes.indices),
+            "mean_value_before": float(np.abs(feedback.values_before).mean()),
+            "mean_value_after": float(np.abs(feedback.values_after).mean()),
+            "mean_discounted_return": performance,
+            "alpha": alpha,
+            "kl_to_target": moved.distribution.kl_to(self._target),
+            "kl_step": old.kl_to(moved.distribution),
+            "moved": moved.accepted,
+            "optimiser_iterations": moved.iterations,
+        }
+        for which, one in (("", moved.distribution), ("target_", self._target)):
+            for name, mean, std in zip(self._bounds.names, one.mean.tolist(), one.std.tolist(), strict=True):
+                numbers |= {f"{which}mean_{name}": mean, f"{which}std_{name}": std}
+        return new, self.selection(new), numbers
+
+    def selection(self, state: ContextState) -> Selection:
+        """The contexts of one iteration, clipped to the bounds: a pure function of (seed, version, distribution)."""
+        random = generator(self._seed, Purpose.DRAWS, state.version)
+        drawn = state.distribution.sample(random, self._draws.count)
+        contexts = self._draws.dealt(np.clip(drawn, self._bounds.low, self._bounds.high))
+        ids = np.full(len(contexts), GENERATED)
+        return Selection(state.version, ids, contexts, order_version=state.version, drawn=True)
+
+
+def weight_of_target(update: int, offset: int, zeta: float, performance: float, to_target: float) -> float:
+    """Alpha of the update-th move, counted from 1: 0 before the `offset`-th, then as large as performance allows.
+
+    performance: mean discounted return, in reward units.  to_target: KL(p || target), in nats.
+    """
+    if update < offset:
+        return 0.0
+    return min(LARGEST_ALPHA, zeta * max(0.0, performance) / max(to_target, SMALLEST_KL))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a move maximises. contexts: (m, d) drawn from `old`; values: (m,) their start values, in reward units."""
+
+    old: Gaussian
+    target: Gaussian
+    contexts: FloatArray
+    values: FloatArray
+    alpha: float
+
+    def value(self, parameters: FloatArray) -> float:
+        """mean_j [ p(c_j) / p_old(c_j) V_j ] - alpha KL(p || target)."""
+        new = Gaussian.from_parameters(parameters)
+        return float((self._ratios(new) * self.values).mean() - self.alpha * new.kl_to(self.target))
+
+    def gradient(self, parameters: FloatArray) -> FloatArray:
+        """Of `value`, by the parameters."""
+        new = Gaussian.from_parameters(parameters)
+        weights = self._ratios(new) * self.values / len(self.values)
+        gradient = new.log_density_gradient(self.contexts, weights)
+        if self.alpha:
+            gradient = gradient - self.alpha * new.kl_to_gradient(self.target)
+        return gradient
+
+    def step_size(self, parameters: FloatArray) -> float:
+        """KL(p_old || p)."""
+        return self.old.kl_to(Gaussian.from_parameters(parameters))
+
+    def step_size_gradient(self, parameters: FloatArray) -> FloatArray:
+        """Of `step_size`, by the parameters."""
+        return Gaussian.from_parameters(parameters).kl_from_gradient(self.old)
+
+    def _ratios(self, new: Gaussian) -> FloatArray:
+        logs = new.log_density(self.contexts) - self.old.log_density(self.contexts)
+        return np.exp(np.minimum(logs, _LARGEST_LOG_RATIO))
+
+
+def by_trust_region(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
+    """SciPy's trust-constr with analytic gradients. A failed search counts if it ends feasible and better."""
+    objective, start, low = _standardised(problem, least_std)
+    # SciPy asks for a feasible start where bounds must not be left.
+    start = start if low is None else np.maximum(start, low)
+    trust = NonlinearConstraint(
+        objective.step_size, -np.inf, epsilon,
+        jac=lambda parameters: objective.step_size_gradient(parameters)[None], hess=BFGS(),
+    )  # fmt: skip
+    found = minimize(
+        lambda parameters: -objective.value(parameters), start, method="trust-constr",
+        jac=lambda parameters: -objective.gradient(parameters), hess=BFGS(), constraints=[trust],
+        bounds=None if low is None else Bounds(low, np.inf, keep_feasible=True),
+        options={"gtol": _GTOL, "xtol": _XTOL},
+    )  # fmt: skip
+    usable = bool(np.isfinite(found.x).all())
+    better = usable and objective.step_size(found.x) <= epsilon and objective.value(found.x) >= objective.value(start)
+    if usable and (found.success or better):
+        return Step(Gaussian.from_parameters(found.x).back_from(problem.old), True, int(found.nit))
+    return Step(problem.old, False, int(found.nit))
+
+
+def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
+    """A natural gradient step as TRPO makes it: conjugate gradients, then a line search for the trust region.
+
+    The standard deviations are clamped behind the step, so a clamped step may leave the trust region.
+    """
+    objective, start, low = _standardised(problem, least_std)
+    fisher = objective.old.fisher()
+    direction, _ = cg(fisher, objective.gradient(start), maxiter=_CG_STEPS)
+    length = float(direction @ fisher @ direction)
+    if length > 0.0:
+        step = np.sqrt(2.0 * epsilon / length) * direction
+        before = objective.value(start)
+        for tried in range(1, _LINE_SEARCH_STEPS + 1):
+            moved = start + step
+            if objective.step_size(moved) <= epsilon and objective.value(moved) > before:
+                moved = moved if low is None else np.maximum(moved, low)
+                return Step(Gaussian.from_parameters(moved).back_from(problem.old), True, tried)
+            step = _SHRINK * step
+    return Step(problem.old, False, _LINE_SEARCH_STEPS)
+
+
+def _standardised(problem: Objective, least_std: FloatArray | None) -> tuple[Objective, FloatArray, FloatArray | None]:
+    """The problem in coordinates in which `old` is standard normal, its parameters there, and their lower limits.
+
+    Ratios and divergences are the same in any coordinates, but in these the search is well conditioned however narrow
+    the distribution has become: in the contexts' own, trust-constr stalls for 1,000 iterations.
+    """
+    old = problem.old
+    contexts = solve_triangular(old.factor, (problem.contexts - old.mean).T, lower=True).T
+    objective = Objective(old.seen_from(old), problem.target.seen_from(old), contexts, problem.values, problem.alpha)
+    d, start = len(old.mean), objective.old.parameters
+    if least_std is None:
+        return objective, start, None
+    low = np.full(len(start), -np.inf)
+    low[d : 2 * d] = np.log(least_std) - np.log(np.diag(old.factor))
+    return objective, start, low
