@@ -370,6 +370,7 @@ def test_hostile_values_do_nothing(manifest: Manifest, tmp_path: Path) -> None:
                       if value.isprintable() else None)  # fmt: skip
         write(made, folder / "x")
         canary, stand_ins = folder / "canary", Stubs(folder / "stubs")
+        (stand_ins.folder / "sleep").symlink_to("/bin/true")  # for there are many
         for script in (TRAIN, AGGREGATE, SUBMIT) if index % 4 == 0 else (TRAIN,):
             _, said = stand_ins.run(folder / "x" / script, C=str(canary), SLURM_JOB_ID=f"17{os.getpid()}{index}")
             assert "syntax error" not in said, (value, script)
