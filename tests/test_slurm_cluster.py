@@ -99,7 +99,7 @@ def space_dist(*arguments: object, slurm: Slurm | None = None) -> str:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)} if slurm is None else slurm.environment
     done = subprocess.run(
         [sys.executable, "-m", "space_dist.cli", *map(str, arguments)],
-        capture_output=True, text=True, timeout=PATIENCE, env=environment, cwd=ROOT,
+        capture_output=True, text=True, timeout=2 * PATIENCE, env=environment, cwd=ROOT,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
