@@ -763,7 +763,7 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
     """
     data = read(path)
     for override in overrides:
-        _apply(data, override)
+        apply_override(data, override)
     if seed is not None:
         data["seed"] = seed
     origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}
@@ -984,7 +984,8 @@ def put(data: dict[str, Any], key: str, value: Any, where: str) -> None:
     section[last] = value
 
 
-def _apply(data: dict[str, Any], override: str) -> None:
+def apply_override(data: dict[str, Any], override: str) -> None:
+    """Set what `a.b=c` says in plain data; the value is read as YAML. Raises ConfigError if it says nothing."""
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts) or not override.isprintable():

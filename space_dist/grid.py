@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import fcntl
 import hashlib
 import logging
 import subprocess
@@ -28,7 +29,7 @@ from space_dist.launch import about, absolute_uri, read_instances
 from space_dist.ledger import Lock
 from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, Run, label_of, load_grid
 from space_dist.provenance import code_digest, git_state, source_digest
-from space_dist.standing import Attempts, Cause, Ended, Standing, may_retry, standing_of, standings
+from space_dist.standing import Attempts, Ended, Standing, may_retry, standing_of, standings, unheard
 from space_dist.training import make_env, make_setup, total_steps
 
 log = logging.getLogger("space_dist")
@@ -95,7 +96,17 @@ def adopt(source: Grid, root: Path) -> Grid:
 
 
 def _freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
-    """Returns the manifest that was there before."""
+    """Returns the manifest that was there before. Tasks of a batch system may all do this at once."""
+    try:
+        grid.folder.mkdir(parents=True, exist_ok=True)
+        with (grid.folder / ".freezing").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return _freeze_alone(grid, manifest, files)
+    except OSError as error:
+        raise LedgerError(f"cannot write the grid's folder {grid.folder}: {error.strerror}") from None
+
+
+def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
     before = None
     if grid.manifest_file.exists():
         with contextlib.suppress(LedgerError):  # a damaged one is replaced
@@ -252,7 +263,6 @@ class Conductor:
         return standings(self._grid, self._manifest, code_digest(), self._runs)
 
     def _begin(self) -> None:
-        self._grid.stop_file.unlink(missing_ok=True)
         adopted = {run.key for run in self._executor.adopt(self._runs)}
         for run in self._runs:
             if run.key in adopted:
@@ -286,7 +296,7 @@ class Conductor:
             history = attempts.history()
             if history.begun and history.last is None and not ledger.owner_alive():
                 # Nobody wrote how it ended: its supervisor is gone, too.
-                attempts.end(history.begun, Ended(Cause.KILLED, "not heard of again"))
+                attempts.end(history.begun, unheard(history.where))
             self._waiting.remove(entry)
             self._executor.start(run, history.begun + 1)
             self._live[run.key] = run
@@ -341,6 +351,7 @@ def working_on(
     lock = _acquired(grid, wait, stop_requested, say)
     pusher = None
     try:
+        grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
         pusher = _start_pusher(grid, manifest)
         yield
     finally:

@@ -318,6 +318,11 @@ class Manifest:
         return [Run(cell, seed) for seed in self.seeds for cell in self.cells]
 
     @property
+    def runs_digest(self) -> str:
+        """`(16 hex digits)` which runs, in which order: what a batch system's task number refers to."""
+        return _sha256({"runs": [run.key for run in self.runs()]})[:16]
+
+    @property
     def experiment(self) -> str:
         """The MLflow experiment."""
         return self.tracking.experiment or self.name

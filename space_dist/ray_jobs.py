@@ -40,6 +40,7 @@ LONG_SECONDS = 300.0  # runs expected to take longer get a job each
 STEPS_PER_SECOND = 4_000.0  # of a run whose speed nobody has measured yet: PPO on PointMass, one core
 _OBJECT_STORE_BYTES = 256 << 20
 _POLL_SECONDS = 1.0
+_NODES_SECONDS = 180.0
 _AGENT_SECONDS = 60.0
 _LATE_SECONDS = 60.0  # without a sign of life of its supervisor a job is taken for lost
 _LIVE = (JobStatus.PENDING, JobStatus.RUNNING)
@@ -51,20 +52,24 @@ _MAX_JOB_NAME = 60
 
 def conduct(
     grid: Grid, manifest: Manifest, runs: Sequence[Run], *, address: str, mode: Mode, max_parallel: int | None,
-    stop_requested: Callable[[], str | None], reinstall: Callable[[], None],
+    nodes: int, stop_requested: Callable[[], str | None], reinstall: Callable[[], None],
     observe: Callable[[Overview], None] = lambda overview: None,
 ) -> list[Standing]:  # fmt: skip
     """Work through `runs` on a private Ray (`address` local) or the cluster we are in; returns where they stand.
 
-    max_parallel: runs at a time; None: as many as fit. `reinstall` is called after Ray has taken the signal handlers.
-    Raises SpaceDistError if there is no room for one run, Interrupted if asked to stop.
+    max_parallel: runs at a time; None: as many as fit. nodes: how many to wait for at first. `reinstall` is called
+    after Ray has taken the signal handlers. Raises SpaceDistError if there is no room for one run, Interrupted if asked
+    to stop.
     """
     with _joined(address, manifest, max_parallel) as dashboard:
         reinstall()
+        _await_nodes(nodes, stop_requested)
         size = _room_for(manifest, max_parallel)
         in_jobs = address != "local" and _as_jobs(grid, manifest, runs, mode)
-        place = Jobs(grid, manifest, size, dashboard) if in_jobs else Pool(grid, manifest, min(size, max(1, len(runs))))
-        with place as executor:
+        pool_size = min(size, max(1, len(runs)))
+        with (
+            Jobs(grid, manifest, size, dashboard) if in_jobs else Pool(grid, manifest, pool_size, stop_requested)
+        ) as executor:
             return Conductor(
                 grid, manifest, runs, executor, stop_requested=stop_requested, observe=observe
             ).conduct()  # fmt: skip
@@ -75,7 +80,7 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
     try:
         if address == "local":
-            cores = len(os.sched_getaffinity(0))
+            cores = _cores()
             # A run with rollout actors may have more processes than this machine has cores; they share them.
             cpus = max(cores, (max_parallel or 1) * manifest.cpus_per_run)
             context = ray.init(
@@ -93,6 +98,23 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
         yield context.address_info.get("webui_url") or ""  # type: ignore[attr-defined]
     finally:
         ray.shutdown()
+
+
+def _cores() -> int:
+    """CPUs that are ours: SLURM may give us fewer than it lets us see."""
+    cores, given = len(os.sched_getaffinity(0)), os.environ.get("SLURM_CPUS_PER_TASK", "")
+    return min(cores, int(given)) if given.isdecimal() and int(given) else cores
+
+
+def _await_nodes(count: int, stop_requested: Callable[[], str | None]) -> None:
+    """Raises Interrupted if they do not come: the next allocation may do better."""
+    until = time.monotonic() + _NODES_SECONDS
+    while (alive := sum(node["Alive"] for node in ray.nodes())) < count:  # type: ignore[no-untyped-call]
+        if reason := stop_requested():
+            raise Interrupted(f"stopped while waiting for the cluster's nodes ({reason})")
+        if time.monotonic() > until:
+            raise Interrupted(f"only {alive} of {count} nodes have joined Ray within {_NODES_SECONDS:.0f} s")
+        time.sleep(_POLL_SECONDS)
 
 
 def _room_for(manifest: Manifest, max_parallel: int | None) -> int:

@@ -15,7 +15,7 @@ import secrets
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -123,8 +123,9 @@ class Pool:
     `size` workers, of one CPU each, beside the CPUs of the runs' own rollout actors.
     """
 
-    def __init__(self, grid: Grid, manifest: Manifest, size: int) -> None:
+    def __init__(self, grid: Grid, manifest: Manifest, size: int, stop_requested: Callable[[], str | None]) -> None:
         self._grid, self._manifest, self._size = grid, manifest, size
+        self._stop_requested = stop_requested
         self._nonce = Nonce(grid)
         self._address = ray.get_runtime_context().gcs_address
         self._slots: list[_Slot] = []
@@ -195,7 +196,7 @@ class Pool:
 
     def _understood(self, run: Run, attempt: int, message: dict[str, Any] | None) -> Ended | None:
         if message is None:
-            lost = Ended(Cause.KILLED, "its supervisor was killed")
+            lost = self._unless_all_end(Ended(Cause.KILLED, "its supervisor was killed"))
             Attempts(self._grid.ledger(run)).end(attempt, lost)
             return lost
         if message["busy"]:
@@ -218,7 +219,12 @@ class Pool:
         alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         if slot.node is not None and slot.node not in alive:
             return Ended(Cause.NODE_LOST, "the node of its worker is gone")
-        return Ended(Cause.KILLED, "its worker was killed")
+        return self._unless_all_end(Ended(Cause.KILLED, "its worker was killed"))
+
+    def _unless_all_end(self, ended: Ended) -> Ended:
+        """A batch system that ends a job signals all its processes, and so us, too: that is nobody's failure."""
+        reason = self._stop_requested()
+        return ended if reason is None else Ended(Cause.PREEMPTED, f"all processes were asked to end ({reason})")
 
     def _hire(self) -> _Slot:
         # Never restarted by Ray: who hires knows what it was doing.

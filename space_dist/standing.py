@@ -153,6 +153,20 @@ class Attempts:
         return History(begun, last, ends, where)
 
 
+def slurm_job() -> dict[str, Any]:
+    """The SLURM job this process is part of, and how often it was requeued before; nothing outside of SLURM."""
+    job, restarts = os.environ.get("SLURM_JOB_ID"), os.environ.get("SLURM_RESTART_COUNT", "0")
+    return {} if job is None else {"slurm_job": job, "restarts": int(restarts) if restarts.isdecimal() else 0}
+
+
+def unheard(where: Mapping[str, Any]) -> Ended:
+    """How an attempt ended that nobody has written the end of; `where` is its own."""
+    here = slurm_job()
+    if here and where.get("slurm_job") == here["slurm_job"] and where.get("restarts", 0) < here["restarts"]:
+        return Ended(Cause.PREEMPTED, "SLURM requeued its job")
+    return Ended(Cause.KILLED, "not heard of again")
+
+
 Condition = Literal["done", "running", "waiting", "failed"]
 
 

@@ -35,7 +35,7 @@ import psutil
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.manifest import Grid, Manifest, Run, RunResources
-from space_dist.standing import Attempts, Cause, Ended, last_lines
+from space_dist.standing import Attempts, Cause, Ended, last_lines, slurm_job
 
 OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
@@ -80,7 +80,7 @@ class Supervisor:
         if ledger.owner_alive():
             return Busy(None, "another process is working on it")
         attempts = Attempts(ledger)
-        attempts.begin(task.attempt, task.where)
+        attempts.begin(task.attempt, {**slurm_job(), **task.where})
         out_of_memory_before = _system_kills()
         child = _Child.fork(lambda: _work(grid, manifest, run, task.address), ledger.folder / OUTPUT)
         watch = _Watch(child, manifest.resources, attempts)

@@ -13,6 +13,7 @@ import typer
 from space_dist.cli import runs
 from space_dist.cli.grids import grid_app
 from space_dist.cli.inputs import config_app, instances_app
+from space_dist.cli.slurm import slurm_app
 from space_dist.cli.worlds import env_app, render
 from space_dist.errors import SpaceDistError
 
@@ -23,6 +24,7 @@ app = typer.Typer(
 for _command in (runs.train, runs.evaluate, runs.report, runs.sync, render):
     app.command()(_command)
 app.add_typer(grid_app, name="grid")
+app.add_typer(slurm_app, name="slurm")
 app.add_typer(instances_app, name="instances")
 app.add_typer(config_app, name="config")
 app.add_typer(env_app, name="env")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from space_dist.grid import Overview
     from space_dist.manifest import Grid, Manifest, Run
     from space_dist.ray_jobs import Mode
+    from space_dist.slurm.queue import Queue
     from space_dist.standing import Standing
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
@@ -42,6 +43,7 @@ _MODES = ("auto", "pool", "jobs")
 _LOG_SECONDS = 30.0
 _SHOWN_RUNS = 12
 _WATCH_SECONDS = 1.0
+_QUEUE_SECONDS = 30.0
 _UNFINISHED = 3
 
 
@@ -96,12 +98,30 @@ def grid_run(
         Optional[str],  # noqa: UP045
         typer.Option(help="Only runs FIRST-LAST of the manifest, counted from 0: the part of a batch system's task."),
     ] = None,
+    nodes: Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")] = 1,
+    stop_file: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Stop, as on a signal, once this file exists: how a batch system's script passes one on."),
+    ] = None,
+    digest: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--runs", help="Refuse a manifest whose runs have another digest than this one."),
+    ] = None,
 ) -> None:
     """Work through a grid: skip what is done, go on with what is not, retry by cause."""
     chosen = _mode(mode)
     _prepare(address)
     place, manifest = frozen(grid, _root(root))
-    found = run_frozen(place, manifest, address=address, mode=chosen, max_parallel=max_parallel, part=part)
+    if digest is not None and digest != manifest.runs_digest:
+        raise ConfigError(
+            f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
+            "export the grid again, and submit that"
+        )
+    if stop_file is not None:
+        STOP.watch(stop_file, manifest.resources.grace_seconds)
+    found = run_frozen(
+        place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part
+    )  # fmt: skip
     raise typer.Exit(tell(manifest, place, found))
 
 
@@ -162,22 +182,26 @@ def grid_status(
 ) -> None:
     """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
     from space_dist.manifest import find_grid
+    from space_dist.slurm.queue import queue_of
     from space_dist.standing import exit_code
 
     place = find_grid(grid, _root(root))
     manifest = place.manifest()
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
+    queue, asked = queue_of(place.folder), time.monotonic()
     while True:
+        if time.monotonic() - asked >= _QUEUE_SECONDS:  # a controller serves everybody
+            queue, asked = queue_of(place.folder), time.monotonic()
         found = _standings(place, manifest)
         if as_json:
-            _print_json(_status_json(manifest, place, found))
+            _print_json(_status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
             if watch and console.is_terminal:
                 console.clear()
             _print_cells(manifest, found)
             _print_failures(found, by_cause)
-            say(_summary(manifest, found) + ("" if place.owner_alive() else "; nobody is working on it now"))
+            say(_summary(manifest, found) + _workers_in_words(place, queue))
         if not watch or all(standing.condition in ("done", "failed") for standing in found):
             raise typer.Exit(exit_code(found))
         time.sleep(_WATCH_SECONDS)
@@ -223,6 +247,7 @@ def grid_stop(
 ) -> None:
     """Have all runs make a checkpoint and end. Running or submitting the grid again goes on from there."""
     from space_dist.manifest import find_grid
+    from space_dist.slurm.queue import queue_of
 
     place = find_grid(grid, _root(root))
     manifest = place.manifest()
@@ -237,13 +262,16 @@ def grid_stop(
         say(f"{manifest.name}: job {conductor.submission_id} was asked to stop its runs, and itself")
         return
     live = [standing for standing in _standings(place, manifest) if standing.condition == "running"]
-    if not live and not place.owner_alive():
+    queue = queue_of(place.folder)
+    if not live and not place.owner_alive() and not (queue and queue.live):
         say(f"{manifest.name}: nothing is running")
         return
     place.stop_file.touch()
     for standing in live:  # those nobody conducts any more, too
         standing.ledger.stop_file.touch()
     say(f"{manifest.name}: {len(live)} runs were asked to make a checkpoint and end")
+    if queue and queue.live:
+        say("SLURM jobs that still wait will end as soon as they start; scancel removes them")
 
 
 @grid_app.command("retry")
@@ -307,7 +335,7 @@ def grid_work(
 
 def run_frozen(
     place: Grid, manifest: Manifest, *, address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
-    part: str | None = None,
+    nodes: int = 1, part: str | None = None,
 ) -> list[Standing]:  # fmt: skip
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
     _prepare(address)
@@ -321,7 +349,7 @@ def run_frozen(
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
         observe = stack.enter_context(_display(manifest, place))
         return conduct(
-            place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel,
+            place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
             stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,
         )  # fmt: skip
 
@@ -494,6 +522,12 @@ def _summary(manifest: Manifest, found: Sequence[Standing]) -> str:
     other = sum(standing.other_code for standing in found)
     parts += [f"{other} of the done ones by another version of this package"] if other else []
     return ", ".join([f"{manifest.name}: {counts['done']} of {len(found)} runs done", *parts])
+
+
+def _workers_in_words(place: Grid, queue: Queue | None) -> str:
+    if queue is not None:
+        return f"\n{queue.in_words()}"
+    return "" if place.owner_alive() else "; nobody is working on it now"
 
 
 def tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:

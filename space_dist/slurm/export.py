@@ -1,0 +1,277 @@
+"""A manifest and a profile become SLURM scripts: pure text, the same for the same input.
+
+Templates are Jinja2 files, ours or a user's own of the same name. What they print is quoted for the shell unless it is
+a number or was made safe before, so that no template can forget it.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import jinja2
+
+from space_dist.config import clean
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.ledger import atomic_write
+from space_dist.manifest import Grid, Manifest
+from space_dist.slurm.profile import Profile
+
+Mode = Literal["array", "cluster"]
+TRAIN, AGGREGATE, SUBMIT, README = "train.sbatch", "aggregate.sbatch", "submit.sh", "README.md"
+JOBS = "slurm_jobs.txt"  # in the grid's folder: `<job id> <what it is>` a line, of the last submission
+_MAX_CHUNKS = 1000
+_CHECKPOINT_SECONDS = 10  # beside the grace time: to notice the signal, and to get back into the queue
+_PLAIN = re.compile(r"[A-Za-z0-9@%+,.:/_-]+")
+
+
+class _Safe(str):
+    """Text that goes into a script as it stands."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True)
+class Export:
+    """How a grid runs on SLURM. root: absolute; None: the grid's folder is the one that holds the scripts.
+
+    Raises ConfigError for what does not go together.
+    """
+
+    manifest: Manifest
+    profile: Profile
+    mode: Mode
+    root: Path | None = None
+
+    def __post_init__(self) -> None:
+        need, lead = self.manifest.resources.grace_seconds + _CHECKPOINT_SECONDS, self.profile.signal.lead_seconds
+        if lead < need:
+            raise ConfigError(
+                f"signal.lead_seconds: {lead} is too short for resources.grace_seconds of {self.manifest.name}; "
+                f"it must be at least {need:g}"
+            )
+        if self.cpus < self.manifest.cpus_per_run:
+            raise ConfigError(
+                f"cpus_per_task: {self.cpus} are too few: each run of {self.manifest.name} needs "
+                f"{self.manifest.cpus_per_run} (1 + resources.workers)"
+            )
+        if self.mode == "cluster" and self.profile.cells_per_task > 1:
+            raise ConfigError("cells_per_task is for array mode; in cluster mode all nodes work on all runs")
+        if self.root is not None and not (self.root.is_absolute() and str(self.root).isprintable()):
+            raise ConfigError(f"--root {clean(str(self.root))!r}: an absolute path of printable characters is needed")
+        if len(self.chunks) > _MAX_CHUNKS:
+            raise ConfigError(f"{len(self.chunks):,} arrays are too many; raise cells_per_task")
+
+    @property
+    def cpus(self) -> int:
+        """Of an array task, or of each node."""
+        return self.profile.cpus_per_task or self.manifest.cpus_per_run
+
+    @property
+    def n_runs(self) -> int:
+        """All of the grid's."""
+        return len(self.manifest.cells) * len(self.manifest.seeds)
+
+    @property
+    def n_tasks(self) -> int:
+        """Array tasks in all."""
+        return -(-self.n_runs // self.profile.cells_per_task)
+
+    @property
+    def parallel(self) -> int:
+        """Runs at a time within an array task."""
+        return min(self.profile.cells_per_task, self.cpus // self.manifest.cpus_per_run)
+
+    @property
+    def chunks(self) -> list[tuple[int, int]]:
+        """First task and number of tasks of each array: MaxArraySize bounds the largest index, not only the size."""
+        size = self.profile.max_array_size
+        return [(first, min(size, self.n_tasks - first)) for first in range(0, self.n_tasks, size)]
+
+    def array(self, count: int) -> str:
+        """Value of `--array`: `0-99%4`."""
+        throttle = self.profile.throttle
+        return f"0-{count - 1}" + (f"%{throttle}" if throttle is not None else "")
+
+    @property
+    def job_name(self) -> str:
+        """Of the training jobs."""
+        return self.profile.job_name or self.manifest.name
+
+    def train_directives(self) -> Iterator[str]:
+        """The `#SBATCH` lines of training."""
+        profile = self.profile
+        yield _directive("job-name", self.job_name)
+        yield from self._common(aggregate=False)
+        yield from _optional({"nodelist": profile.nodelist, "exclude": profile.exclude,
+                              "dependency": profile.dependency})  # fmt: skip
+        yield _directive("nodes", profile.nodes if self.mode == "cluster" else 1)
+        yield _directive("ntasks-per-node", 1)
+        yield _directive("cpus-per-task", self.cpus)
+        yield from _optional({"time": profile.time, "mem": profile.mem, "mem-per-cpu": profile.mem_per_cpu,
+                              "gres": profile.gres, "gpus": profile.gpus})  # fmt: skip
+        if profile.exclusive:
+            yield _directive("exclusive", None if profile.exclusive is True else profile.exclusive)
+        yield from self._outputs(array=self.mode == "array")
+        yield _directive("open-mode", "append")
+        yield _directive("requeue", None)
+        yield _directive("signal", f"B:{profile.signal.name}@{profile.signal.lead_seconds}")
+        if self.mode == "array":
+            yield _directive("array", self.array(self.chunks[0][1]))
+        yield from self._extra()
+
+    def aggregate_directives(self) -> Iterator[str]:
+        """The `#SBATCH` lines of the job that checks and reports."""
+        own = self.profile.aggregate
+        yield _directive("job-name", f"{self.job_name}-aggregate")
+        yield from self._common(aggregate=True)
+        yield _directive("nodes", 1)
+        yield _directive("ntasks-per-node", 1)
+        yield _directive("cpus-per-task", 1)
+        yield from _optional({"time": own.time or self.profile.time, "mem": own.mem})
+        yield from self._outputs(array=False)
+        yield _directive("open-mode", "append")
+        yield from self._extra()
+
+    def _common(self, *, aggregate: bool) -> Iterator[str]:
+        profile, own = self.profile, self.profile.aggregate
+        yield from _optional({
+            "partition": (aggregate and own.partition) or profile.partition, "account": profile.account,
+            "qos": (aggregate and own.qos) or profile.qos, "constraint": profile.constraint,
+            "reservation": profile.reservation, "comment": profile.comment, "mail-user": profile.mail_user,
+            "mail-type": ",".join(profile.mail_type) or None,
+        })  # fmt: skip
+
+    def _outputs(self, *, array: bool) -> Iterator[str]:
+        files = {"output": self.profile.output, "error": self.profile.error}
+        yield from _optional(
+            {name: file if array or not file else file.replace("%A_%a", "%j") for name, file in files.items()}
+        )
+
+    def _extra(self) -> Iterator[str]:
+        for line in self.profile.extra:
+            name, _, value = line[2:].partition("=")
+            yield _directive(name, value if "=" in line else None)
+
+    def log_folders(self) -> list[str]:
+        """Folders that must be there before a job can write its output; those with a % in them are SLURM's business."""
+        files = [file for file in (self.profile.output, self.profile.error) if file]
+        folders = [str(PurePosixPath(file).parent) for file in files]
+        return sorted({folder for folder in folders if "%" not in folder and folder != "."})
+
+
+def export(
+    grid: Export, instances: Mapping[str, bytes], folder: Path, templates: Path | None = None
+) -> list[Path]:  # fmt: skip
+    """Write the scripts, their README and the frozen grid into `folder`; returns the files, the manifest's last.
+
+    Raises ConfigError if the folder holds another grid, or cannot be written.
+    """
+    place = Grid(folder)
+    if place.manifest_file.exists():
+        try:
+            other = place.manifest().runs_digest != grid.manifest.runs_digest
+        except LedgerError:
+            other = True
+        if other:
+            raise ConfigError(f"{folder} holds another grid; --out names another folder")
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in render(grid, templates).items():
+            atomic_write(folder / name, text.encode())
+            if name == SUBMIT:
+                (folder / name).chmod(0o755)
+            written.append(folder / name)
+    except OSError as error:
+        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+    place.freeze(grid.manifest, instances)
+    return [*written, place.manifest_file]
+
+
+def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
+    """File name -> text of every script and of the README. `templates`: a folder whose files replace ours.
+
+    Raises ConfigError with file and line of a template's fault.
+    """
+    shell = _environment(templates)
+    prose = shell.overlay(finalize=None)
+    files = {TRAIN: f"{grid.mode}.sbatch.j2", AGGREGATE: "aggregate.sbatch.j2", SUBMIT: "submit.sh.j2",
+             README: "README.md.j2"}  # fmt: skip
+    values = _values(grid)
+    texts = {}
+    for name, template in files.items():
+        try:
+            texts[name] = (prose if name == README else shell).get_template(template).render(values)
+        except jinja2.TemplateNotFound as error:
+            raise ConfigError(f"template {error.name} is missing") from None
+        except jinja2.TemplateSyntaxError as error:
+            raise ConfigError(
+                f"template {error.filename or error.name}, line {error.lineno}: {error.message}"
+            ) from None
+        except jinja2.TemplateError as error:
+            raise ConfigError(f"template {template}: {error.message}") from None
+    return texts
+
+
+@functools.lru_cache(maxsize=4)
+def _environment(templates: Path | None) -> jinja2.Environment:
+    loader = jinja2.ChoiceLoader([
+        *([jinja2.FileSystemLoader(templates)] if templates is not None else []),
+        jinja2.PackageLoader("space_dist.slurm"),
+    ])  # fmt: skip
+    return jinja2.Environment(
+        loader=loader, undefined=jinja2.StrictUndefined, finalize=_quoted, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True, autoescape=False,  # noqa: S701 - `finalize` quotes, for the shell
+    )  # fmt: skip
+
+
+def _values(grid: Export) -> dict[str, Any]:
+    """What templates may print."""
+    manifest, profile = grid.manifest, grid.profile
+    return {
+        "name": manifest.name, "mode": grid.mode, "job_name": grid.job_name, "digest": manifest.runs_digest,
+        "n_runs": grid.n_runs, "n_cells": len(manifest.cells), "n_seeds": len(manifest.seeds),
+        "n_tasks": grid.n_tasks, "per_task": profile.cells_per_task, "parallel": grid.parallel,
+        "chunks": [{"first": first, "array": grid.array(count)} for first, count in grid.chunks],
+        "throttle": profile.throttle, "cpus": grid.cpus, "nodes": profile.nodes,
+        "train_directives": [_Safe(line) for line in grid.train_directives()],
+        "aggregate_directives": [_Safe(line) for line in grid.aggregate_directives()],
+        "root": None if grid.root is None else str(grid.root), "log_folders": grid.log_folders(), "jobs": JOBS,
+        "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
+        "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
+        "sync": manifest.tracking.uri is not None,
+        "env": {_Safe(name): value for name, value in profile.env.items()},
+        "modules": profile.modules, "venv": profile.venv, "conda": profile.conda,
+        "apptainer": profile.apptainer, "apptainer_options": profile.apptainer_options,
+        "prologue": [_Safe(line) for line in profile.prologue], "command": profile.command,
+        "interface": profile.interface, "temp": profile.temp,
+    }  # fmt: skip
+
+
+def _quoted(value: Any) -> Any:
+    """For the shell; templates print numbers and what is safe already as they are."""
+    if isinstance(value, bool) or value is None:
+        raise jinja2.TemplateRuntimeError(f"prints {value!r}, which is no text")
+    return value if isinstance(value, (int, _Safe)) else shlex.quote(str(value))
+
+
+def _optional(options: Mapping[str, str | int | None]) -> Iterator[str]:
+    for name, value in options.items():
+        if value is not None:
+            yield _directive(name, value)
+
+
+def _directive(name: str, value: str | int | None) -> str:
+    """One `#SBATCH` line. sbatch reads it with rules of its own: # begins a comment even in quotes."""
+    if value is None:
+        return f"#SBATCH --{name}"
+    text = str(value)
+    if not _PLAIN.fullmatch(text):
+        text = '"' + re.sub(r'(["\\#])', r"\\\1", text) + '"'
+    return f"#SBATCH --{name}={text}"

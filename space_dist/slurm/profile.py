@@ -1,0 +1,243 @@
+"""What a site and its user want from SLURM: one small YAML file. Only what is set is written into scripts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from space_dist import config as configs
+from space_dist.config import NAME, Section
+from space_dist.errors import nearest
+
+_MAX_WORD, _MAX_LINE, _MAX_ITEMS = 200, 1000, 50  # sbatch reads a directive into 8 KiB
+_EXTRA = re.compile(r"--([a-z][a-z0-9-]{0,40})(=.*)?")
+_TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<rest>\d+(?::\d+){0,2})")
+_MEMORY = r"^[0-9]{1,12}[KMGT]?$"
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+# What the scripts themselves are made of, and what would have sbatch do something else.
+_OURS = {
+    "array", "chdir", "kill-on-invalid-dep", "ntasks", "ntasks-per-node", "open-mode", "parsable", "requeue",
+    "no-requeue", "test-only", "wait", "wrap", "help", "usage", "version",
+}  # fmt: skip
+
+
+def _one_line(value: str) -> str:
+    """Nothing that ends a line or commands a terminal; quoting takes care of all the rest."""
+    if not value.isprintable():
+        raise ValueError("it must be one line of printable characters")
+    return value
+
+
+def _no_option(value: str) -> str:
+    if value.startswith("-"):
+        raise ValueError("it must not begin with a hyphen")
+    return _one_line(value)
+
+
+Word = Annotated[str, Field(min_length=1, max_length=_MAX_WORD), AfterValidator(_no_option)]
+Text = Annotated[str, Field(min_length=1, max_length=_MAX_LINE), AfterValidator(_no_option)]
+Line = Annotated[str, Field(min_length=1, max_length=_MAX_LINE), AfterValidator(_one_line)]
+Memory = Annotated[str, Field(pattern=_MEMORY)]
+MailType = Literal[
+    "NONE", "BEGIN", "END", "FAIL", "REQUEUE", "ALL", "INVALID_DEPEND", "STAGE_OUT", "TIME_LIMIT", "TIME_LIMIT_90",
+    "TIME_LIMIT_80", "TIME_LIMIT_50", "ARRAY_TASKS",
+]  # fmt: skip
+
+
+class Notice(Section):
+    """The signal by which SLURM announces that a job's time is nearly over."""
+
+    name: Literal["USR1", "USR2", "HUP"] = "USR1"
+    """Which; TERM is none of them, since SLURM ends cancelled jobs with it, and these must not come back."""
+    lead_seconds: int = Field(default=120, ge=10, le=65535)
+    """How long before the time limit. SLURM may send it up to 60 s earlier. At least the grid's
+    resources.grace_seconds and 10 s more."""
+
+
+class Aggregation(Section):
+    """What the job that checks and reports in the end needs, where that differs from training."""
+
+    partition: Word | None = None
+    qos: Word | None = None
+    time: str | int | None = None
+    mem: Memory | int | None = None
+
+    @field_validator("time")
+    @classmethod
+    def _time(cls, value: str | int | None) -> str | int | None:
+        return _checked_time(value)
+
+
+class Profile(Section):
+    """A site's profile. Every field is optional; each is written only if it is set."""
+
+    job_name: str | None = Field(default=None, pattern=NAME)
+    """Name of the jobs; null: the grid's."""
+    partition: Word | None = None
+    """Partition, or several separated by commas."""
+    account: Word | None = None
+    """Whom to charge."""
+    qos: Word | None = None
+    """Quality of service."""
+    constraint: Word | None = None
+    """Features a node must have. Runs are promised to give the same bits on the same CPU model: name it here."""
+    nodelist: Word | None = None
+    """Nodes to use."""
+    exclude: Word | None = None
+    """Nodes not to use."""
+    reservation: Word | None = None
+    """Reservation."""
+    time: str | int | None = None
+    """Time limit of a job, as SLURM writes it (minutes, HH:MM:SS, D-HH:MM:SS, ...). What is not done by then goes on
+    from its checkpoint in the next one."""
+    nodes: int = Field(default=2, ge=1, le=10_000)
+    """Nodes of the one allocation in cluster mode. Array tasks have one each."""
+    cpus_per_task: int | None = Field(default=None, ge=1, le=10_000)
+    """CPUs of an array task, or of each node in cluster mode; null: what one run needs (1 + resources.workers)."""
+    mem: Memory | int | None = None
+    """Memory of a node's part of a job (megabytes, or with K, M, G, T)."""
+    mem_per_cpu: Memory | int | None = None
+    """Memory for each CPU instead of `mem`."""
+    gres: Word | None = None
+    """Generic resources, like gpu:1."""
+    gpus: Word | int | None = None
+    """GPUs."""
+    exclusive: bool | Literal["user", "mcs"] = False
+    """Whether to share nodes with no other job (true), or with none of another user."""
+    throttle: int | None = Field(default=None, ge=1, le=1_000_000)
+    """Array tasks at a time; in cluster mode: runs at a time. null: as many as there is room for."""
+    cells_per_task: int = Field(default=1, ge=1, le=100_000)
+    """Runs that an array task does, one after another, or side by side if it has the CPUs. More than 1 suits runs that
+    are short beside the half minute it takes to start."""
+    max_array_size: int = Field(default=1001, ge=2, le=4_000_001)
+    """The site's MaxArraySize (`scontrol show config`). More tasks are written as several arrays."""
+    output: Text = "logs/%x-%A_%a.out"
+    """File of a job's output: %x its name, %A and %a array and task, %j job; for jobs that are no array, %A_%a is
+    written as %j. Its folder is made before submission."""
+    error: Text | None = None
+    """File of a job's errors; null: the same."""
+    mail_user: Word | None = None
+    """Who gets mail."""
+    mail_type: tuple[MailType, ...] = Field(default=(), strict=False)
+    """When: [END, FAIL], ..."""
+    dependency: Word | None = None
+    """What training waits for, like afterok:1234."""
+    signal: Notice = Notice()
+    max_requeues: int = Field(default=50, ge=0, le=1000)
+    """How often a job that was interrupted puts itself back into the queue."""
+    comment: Text | None = None
+    """A comment."""
+    extra: tuple[Line, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
+    """Further options of sbatch that have no field here: [--licenses=matlab:1, ...]."""
+    aggregate: Aggregation = Aggregation()
+    env: dict[str, Annotated[str, Field(max_length=_MAX_LINE), AfterValidator(_one_line)]] = Field(
+        default={}, max_length=_MAX_ITEMS
+    )
+    """Environment variables, set to exactly these texts: nothing in them is expanded."""
+    modules: tuple[Word, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
+    """Modules to load."""
+    venv: Text | None = None
+    """Folder of a Python virtual environment to activate."""
+    conda: Text | None = None
+    """Name or folder of a conda environment to activate."""
+    apptainer: Text | None = None
+    """Container image to run everything in. It must see the grid's folder and `temp`."""
+    apptainer_options: tuple[Line, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
+    """Options of `apptainer exec`, a word each: [--bind, /scratch]."""
+    prologue: tuple[Line, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
+    """Lines of shell, written as they are, before anything of ours runs. Whoever writes them runs them."""
+    command: tuple[Line, ...] = Field(default=("space-dist",), min_length=1, max_length=_MAX_ITEMS, strict=False)
+    """How to call this package there, a word each: [python, -m, space_dist.cli]."""
+    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,30}$")] | None = None
+    """Network interface of the nodes for Ray in cluster mode, like ib0; null: the one that faces the other nodes."""
+    temp: Annotated[str, Field(max_length=40, pattern=r"^/"), AfterValidator(_one_line)] = "/tmp"  # noqa: S108 - the node's own
+    """Folder on the nodes' own disks for what lives as long as a job. Short: Ray's sockets lie below it, and Linux
+    allows 107 bytes for their paths."""
+
+    @field_validator("time")
+    @classmethod
+    def _time(cls, value: str | int | None) -> str | int | None:
+        return _checked_time(value)
+
+    @field_validator("extra")
+    @classmethod
+    def _extras(cls, lines: tuple[str, ...]) -> tuple[str, ...]:
+        for line in lines:
+            found = _EXTRA.fullmatch(line)
+            if not found:
+                raise ValueError(f"{line!r} is no long option of sbatch: write --name or --name=value")
+            name = found.group(1)
+            if name in _OURS:
+                raise ValueError(f"--{name} is what these scripts are made of; it cannot be set here")
+            if (field := name.replace("-", "_")) in cls.model_fields:
+                raise ValueError(f"--{name} has a field of its own: {field}")
+        return lines
+
+    @field_validator("env")
+    @classmethod
+    def _variables(cls, variables: dict[str, str]) -> dict[str, str]:
+        for name in variables:
+            if not _VARIABLE.fullmatch(name) or len(name) > _MAX_WORD:
+                raise ValueError(f"{name[:_MAX_WORD]!r} is no name of an environment variable")
+            if name.startswith("SLURM_") or name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_TMPDIR", "BASH_ENV"):
+                raise ValueError(f"{name} is set by SLURM or by these scripts")
+        return variables
+
+    @field_validator("command")
+    @classmethod
+    def _program(cls, words: tuple[str, ...]) -> tuple[str, ...]:
+        _no_option(words[0])
+        return words
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        if self.mem is not None and self.mem_per_cpu is not None:
+            raise ValueError("mem and mem_per_cpu exclude each other")
+        if self.apptainer_options and self.apptainer is None:
+            raise ValueError("apptainer_options needs apptainer")
+        if self.venv is not None and self.conda is not None:
+            raise ValueError("venv and conda exclude each other")
+        limit = seconds(self.time)
+        if limit is not None and limit <= self.signal.lead_seconds:
+            raise ValueError(f"time ({limit} s) must be longer than signal.lead_seconds ({self.signal.lead_seconds} s)")
+        return self
+
+
+def load_profile(path: Path | None, overrides: Sequence[str] = ()) -> Profile:
+    """A profile from its YAML file (None: all defaults), with `key=value` overrides.
+
+    Raises ConfigError with file and key of every fault.
+    """
+    data: dict[str, Any] = {} if path is None else configs.read_yaml(path)
+    for override in overrides:
+        configs.apply_override(data, override)
+    origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}
+    return configs.check(Profile, data, str(path or "the default profile"), origins)
+
+
+def seconds(time: str | int | None) -> int | None:
+    """A time limit as SLURM writes it, in seconds; None without one."""
+    if time is None:
+        return None
+    found = _TIME.fullmatch(str(time))
+    if found is None:
+        return None
+    days, parts = int(found["days"] or 0), [int(part) for part in found["rest"].split(":")]
+    if found["days"] is not None:  # D-HH[:MM[:SS]]
+        hours, minutes, rest = (*parts, 0, 0)[:3]
+    elif len(parts) == 3:
+        hours, minutes, rest = parts
+    else:  # MM[:SS]
+        hours, minutes, rest = 0, *(*parts, 0)[:2]
+    return ((24 * days + hours) * 60 + minutes) * 60 + rest
+
+
+def _checked_time(value: str | int | None) -> str | int | None:
+    if value is not None and (len(str(value)) > 20 or not seconds(value)):
+        near = nearest(str(value), ["30", "01:00:00", "1-00:00:00"])
+        raise ValueError(f"write minutes, MM:SS, HH:MM:SS, D-HH, D-HH:MM or D-HH:MM:SS{near.rstrip('.')}")
+    return value

@@ -1,0 +1,657 @@
+"""The SLURM scripts as text, and run by bash against stand-ins: quoting, signals, requeues, chunks, submission."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from space_dist import cli
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.grid import Conductor, adopt, plan, working_on
+from space_dist.manifest import Grid, Manifest, Run
+from space_dist.slurm import Export, Mode, Profile, export, load_profile
+from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN, render
+from space_dist.slurm.node import address_facing
+from space_dist.slurm.profile import seconds
+from space_dist.slurm.queue import queue_of
+from space_dist.standing import Cause, Ended, slurm_job, unheard
+
+ROOT = Path(__file__).resolve().parent.parent
+GRID, SITE = ROOT / "configs/grids/pointmass_small.yaml", ROOT / "configs/slurm/site.yaml"
+EXAMPLES = ROOT / "slurm/examples"
+MODES: tuple[Mode, ...] = ("array", "cluster")
+STUBS = ("sbatch", "squeue", "sacct", "scancel", "scontrol", "srun", "module", "conda", "apptainer", "space-dist")
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Grid:
+    """Three cells x two seeds, frozen."""
+    return plan(GRID, tmp_path_factory.mktemp("frozen")).grid
+
+
+@pytest.fixture(scope="module")
+def manifest(grid: Grid) -> Manifest:
+    return grid.manifest()
+
+
+def profile(**settings: Any) -> Profile:
+    return Profile.model_validate(settings)
+
+
+class Stubs:
+    """A PATH on which every command of SLURM and ours only writes down how it was called."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.log = folder / "bin", folder / "calls"
+        self.folder.mkdir(parents=True)
+        for name in STUBS:
+            (self.folder / name).symlink_to(ROOT / "tests/slurm/stub")
+        self.environment = {
+            "PATH": f"{self.folder}:/usr/bin:/bin", "STUB_LOG": str(self.log), "HOME": str(folder),
+            "SLURM_JOB_ID": "17", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "0", "SLURM_CPUS_PER_TASK": "2",
+            "SLURM_JOB_NUM_NODES": "2", "SLURM_JOB_NODELIST": "n[1-2]",
+        }  # fmt: skip
+
+    def start(self, script: Path, *arguments: str, **extra: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            ["bash", str(script), *arguments], cwd=script.parent,
+            env={**self.environment, "SLURM_SUBMIT_DIR": str(script.parent), **extra},
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def run(self, script: Path, *arguments: str, **extra: str) -> tuple[int, str]:
+        """Exit code, and all that was said."""
+        process = self.start(script, *arguments, **extra)
+        out, err = process.communicate(timeout=60)
+        return process.returncode, out + err
+
+    def calls(self, name: str | None = None) -> list[list[str]]:
+        """Every call since the last time this was asked: name and arguments."""
+        parts = self.log.read_text().split("\0") if self.log.exists() else []
+        self.log.unlink(missing_ok=True)
+        found, index = [], 0
+        while index < len(parts) - 1:
+            count = int(parts[index])
+            found.append(parts[index + 1 : index + 2 + count])
+            index += 2 + count
+        return [call for call in found if name in (None, call[0])]
+
+
+@pytest.fixture
+def stubs(tmp_path: Path) -> Stubs:
+    return Stubs(tmp_path / "stubs")
+
+
+def write(made: Export, folder: Path) -> Path:
+    """The scripts, without the grid itself."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in render(made).items():
+        (folder / name).write_text(text)
+    (folder / "manifest.json").touch()
+    (folder / "t").mkdir(exist_ok=True)
+    return folder
+
+
+def temp(folder: Path) -> str:
+    """A short path to a folder of a test's own, for what would be in /tmp."""
+    link = Path(f"/tmp/sp{os.getpid()}-{abs(hash(str(folder))) % 10**6}")  # noqa: S108 - sockets need short paths
+    link.unlink(missing_ok=True)
+    link.symlink_to(folder)
+    return str(link)
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Iterator[str]:
+    (tmp_path / "node").mkdir()
+    link = temp(tmp_path / "node")
+    yield link
+    Path(link).unlink()
+
+
+# ---- text -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_examples_are_what_export_writes(mode: Mode, manifest: Manifest) -> None:
+    settings = ["cells_per_task=2", "throttle=2"] if mode == "array" else ["cpus_per_task=4"]
+    texts = render(Export(manifest, load_profile(SITE, settings), mode))
+    assert {name: (EXAMPLES / mode / name).read_text() for name in texts} == texts
+    assert render(Export(manifest, load_profile(SITE, settings), mode)) == texts
+
+
+def test_only_what_is_set_is_written(manifest: Manifest) -> None:
+    bare = render(Export(manifest, profile(), "array"))[TRAIN]
+    assert re.findall(r"^#SBATCH --([a-z-]+)", bare, re.MULTILINE) == [
+        "job-name", "nodes", "ntasks-per-node", "cpus-per-task", "output", "open-mode", "requeue", "signal", "array",
+    ]  # fmt: skip
+    full = render(Export(manifest, _everything(), "array"))
+    for name in ("partition", "account", "qos", "constraint", "nodelist", "exclude", "reservation", "time", "mem",
+                 "gres", "gpus", "exclusive", "error", "mail-user", "mail-type", "dependency", "comment",
+                 "licenses"):  # fmt: skip
+        assert len(re.findall(rf"^#SBATCH --{name}\b(?!-)", full[TRAIN], re.MULTILINE)) == 1, name
+    assert "#SBATCH --partition=late\n" in full[AGGREGATE]
+    assert "--nodelist" not in full[AGGREGATE]
+    assert "--array" not in full[AGGREGATE]
+
+
+def _everything(**more: Any) -> Profile:
+    return profile(**{
+        "partition": "cpu", "account": "me", "qos": "high", "constraint": "avx", "nodelist": "n[1-3]", "exclude": "n9",
+        "reservation": "r", "time": "1-00:00:00", "mem": "3G", "gres": "gpu:1", "gpus": 1, "exclusive": "user",
+        "error": "logs/%A_%a.err", "mail_user": "me@x.org", "mail_type": ["END", "FAIL"], "dependency": "afterok:1",
+        "comment": "a comment", "extra": ["--licenses=m:1"], "aggregate": {"partition": "late"}, "throttle": 2,
+        "modules": ["python/3.11"], "conda": "env", "env": {"A": "b"}, "prologue": ["umask 027"], "interface": "ib0",
+        "apptainer": "/x.sif", "apptainer_options": ["--bind", "/scratch"], **more,
+    })  # fmt: skip
+
+
+def test_the_commented_profile_names_every_field() -> None:
+    text = SITE.read_text()
+    assert [name for name in Profile.model_fields if not re.search(rf"^(# )?{name}:", text, re.MULTILINE)] == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["partitoin=x"], ["partitoin", "did you mean 'partition'?"]),
+        (["time=soon"], ["time", "'soon'", "HH:MM:SS"]),
+        (["time=1"], ["time (60 s)", "signal.lead_seconds (120 s)"]),
+        (["mem=3 GB"], ["mem", "3 GB"]),
+        (["mem=3G", "mem_per_cpu=1G"], ["mem and mem_per_cpu exclude each other"]),
+        (["extra=[--partition=x]"], ["--partition has a field of its own: partition"]),
+        (["extra=[--wrap=ls]"], ["--wrap", "cannot be set here"]),
+        (["extra=[-p x]"], ["no long option of sbatch"]),
+        (["mail_type=[SOMETIMES]"], ["mail_type", "SOMETIMES"]),
+        (["partition=-x"], ["partition", "must not begin with a hyphen"]),
+        (["env={A-B: x}"], ["env", "no name of an environment variable"]),
+        (["env={RAY_AUTH_TOKEN: x}"], ["RAY_AUTH_TOKEN", "set by SLURM or by these scripts"]),
+        (["temp=relative"], ["temp", "relative"]),
+        (["job_name=../../x"], ["job_name", "../../x"]),
+        (["throttle=0"], ["throttle", "0"]),
+        (["signal.name=TERM"], ["signal.name", "TERM"]),
+    ],
+)
+def test_a_wrong_profile_is_refused_in_a_sentence(settings: list[str], said: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_profile(None, settings)
+    for part in said:
+        assert part in str(caught.value)
+
+
+def test_what_does_not_go_together_is_refused(manifest: Manifest) -> None:
+    with pytest.raises(ConfigError, match=r"lead_seconds: 30 is too short for resources.grace_seconds"):
+        Export(manifest, profile(signal={"lead_seconds": 30}), "array")
+    with pytest.raises(ConfigError, match="in cluster mode all nodes work on all runs"):
+        Export(manifest, profile(cells_per_task=2), "cluster")
+    with pytest.raises(ConfigError, match="absolute path"):
+        Export(manifest, profile(), "array", Path("runs"))
+    wide = dataclasses.replace(manifest, resources=manifest.resources.model_copy(update={"workers": 3}))
+    with pytest.raises(ConfigError, match=r"cpus_per_task: 2 are too few: each run of pointmass_small needs 4"):
+        Export(wide, profile(cpus_per_task=2), "array")
+    assert Export(wide, profile(cells_per_task=4, cpus_per_task=9), "array").parallel == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("30", 1800), (90, 5400), ("1:30", 90), ("2:00:00", 7200), ("1-0", 86400), ("1-2:03", 93780),
+     ("1-00:00:01", 86401), ("", None), ("1:2:3:4", None), ("x", None)],
+)  # fmt: skip
+def test_time_limits_are_read_as_slurm_does(text: str | int, expected: int | None) -> None:
+    assert seconds(text) == expected
+
+
+def test_templates_can_be_replaced_and_their_faults_are_named(manifest: Manifest, tmp_path: Path) -> None:
+    made = Export(manifest, profile(comment="it's"), "array")
+    (tmp_path / "finish.sh.j2").write_text('echo {{ temp ~ "\'" }}\nexit 0\n')
+    text = render(made, tmp_path)[TRAIN]
+    assert text.endswith("""echo '/tmp'"'"''\nexit 0\n""")  # quoted without being asked to
+    assert "scontrol requeue" not in text
+    (tmp_path / "finish.sh.j2").write_text("\n{% if %}")
+    with pytest.raises(ConfigError, match=r"finish\.sh\.j2, line 2"):
+        render(made, tmp_path)
+    (tmp_path / "finish.sh.j2").write_text("{{ no_such_value }}")
+    with pytest.raises(ConfigError, match="no_such_value"):
+        render(made, tmp_path)
+
+
+def test_export_freezes_the_grid_and_refuses_to_mix_two(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
+    files = grid.instance_files(manifest)
+    export(Export(manifest, profile(), "array"), files, tmp_path / "out")
+    assert Grid(tmp_path / "out").manifest() == manifest
+    assert os.access(tmp_path / "out" / SUBMIT, os.X_OK)
+    before = (tmp_path / "out" / TRAIN).read_text()
+    export(Export(manifest, profile(comment="again"), "array"), files, tmp_path / "out")
+    assert (tmp_path / "out" / TRAIN).read_text() != before
+    other = dataclasses.replace(manifest, seeds=(5,))
+    with pytest.raises(ConfigError, match="holds another grid"):
+        export(Export(other, profile(), "array"), files, tmp_path / "out")
+
+
+def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+    def run(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as error:
+            code = int(error.code or 0)
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err
+        return code, said.out + said.err
+
+    stand_ins = Stubs(tmp_path / "stubs")
+    monkeypatch.setenv("PATH", f"{stand_ins.folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("STUB_LOG", str(stand_ins.log))
+    out = tmp_path / "out"
+    code, said = run("slurm", "export", GRID, "--out", out, "--profile", SITE, "--throttle", 2, "--cells-per-task", 4,
+                     "--set", "partition=long", "--check")  # fmt: skip
+    assert code == 0, said
+    assert "6 runs in 2 array tasks" in said
+    assert "sbatch --test-only: no objection" in said
+    text = (out / TRAIN).read_text()
+    assert "#SBATCH --array=0-1%2\n" in text
+    assert "#SBATCH --partition=long\n" in text
+    assert [call[1:] for call in stand_ins.calls("sbatch")] == [["--test-only", TRAIN], ["--test-only", AGGREGATE]]
+    assert run("slurm", "submit", out)[0] == 0
+    code, said = run("grid", "status", out)
+    assert code == 3
+    assert "SLURM jobs: train 103; aggregate 104" in said
+    assert run("slurm", "submit", tmp_path)[0] == 2
+    assert run("slurm", "export", out, "--out", tmp_path / "copy")[0] == 0
+    code, said = run("slurm", "export", out, "--out", tmp_path / "copy", "--mode", "arry")
+    assert (code, "did you mean 'array'?" in said) == (2, True)
+    code, said = run("grid", "run", out, "--part", "0-0", "--runs", "0123456789abcdef")
+    assert (code, "export the grid again" in said) == (2, True)
+
+
+# ---- nothing a value holds can do anything --------------------------------------------------------------------------
+
+_ACTS = (
+    '"; >$C; "', "'; >$C; '", "$(>$C)", "`>$C`", "; >$C #", "| >$C", "&& >$C", "& >$C &", '\\"; >$C; #', "\\'; >$C; '",
+    '"$(>$C)"', "'\"'\"'; >$C; '", "$((a[$(>$C)]))", ">$C", "<(>$C)", "\\\n>$C\n", "x\r\n>$C", "${x:-$(>$C)}",
+    "{{ 7*7 }}; >$C", "{% raw %}$(>$C)", ") ; >$C ; (", "!! # \\", "~/*; >$C",
+)  # fmt: skip
+_BEFORE = ("", "x", " ", "'", '"', "\\", "$", "`", "-", "%")
+HOSTILE = [before + act for before in _BEFORE for act in _ACTS]
+
+
+def test_the_hostile_values_are_hostile(tmp_path: Path) -> None:
+    """Unquoted, or in quotes of the template's, many of them act: the tests below can fail."""
+    acted = 0
+    for index, value in enumerate(HOSTILE):
+        canary = tmp_path / str(index)
+        for form in (f"echo {value}", f'echo "{value}"', f"echo '{value}'"):
+            subprocess.run(
+                ["bash", "-c", form], env={"C": str(canary), "PATH": "/bin"}, capture_output=True, cwd=tmp_path
+            )
+        acted += canary.exists()
+    assert len(HOSTILE) >= 200
+    assert acted > 120
+
+
+def _sbatch_reads(line: str) -> str:
+    """What sbatch's own parser takes for the one argument of an `#SBATCH` line (src/sbatch/opt.c, _get_argument)."""
+    text, quote, escaped, said = line.removeprefix("#SBATCH "), "", False, ""
+    for character in text:
+        if escaped:
+            escaped = False
+        elif character == "\\":
+            escaped = True
+            continue
+        elif quote and character == quote:
+            quote = ""
+            continue
+        elif not quote and character in "\"'":
+            quote = character
+            continue
+        elif not quote and (character.isspace() or character == "#"):
+            raise AssertionError(f"{line!r} goes on after its argument")
+        said += character
+    assert not quote
+    assert not escaped
+    return said
+
+
+def _hostile_profile(value: str) -> tuple[dict[str, Any], list[str]]:
+    """A profile with `value` in every field that holds text, where the schema lets it be; and the fields that do."""
+    one = {"conda": value, "apptainer": value, "output": value, "error": value, "comment": value, "mail_user": value,
+           "partition": value, "account": value, "qos": value, "constraint": value, "nodelist": value,
+           "exclude": value, "reservation": value, "gres": value, "gpus": value, "dependency": value,
+           "time": value, "mem": value, "mem_per_cpu": value, "job_name": value, "interface": value,
+           "temp": f"/{value}", "venv": value, "exclusive": value}  # fmt: skip
+    wrapped: dict[str, Any] = {
+        "modules": [value], "apptainer_options": [value], "extra": [f"--licenses={value}"], "env": {"HOSTILE": value},
+        "command": ["space-dist", value], "mail_type": [value], "signal": {"name": value},
+        "aggregate": {"partition": value, "qos": value, "mem": "1G"},
+    }  # fmt: skip
+    taken: dict[str, Any] = {}
+    for name, setting in {**one, **wrapped}.items():
+        try:
+            Profile.model_validate({name: setting} | ({"apptainer": "x"} if name == "apptainer_options" else {}))
+        except ValueError:
+            continue
+        taken[name] = setting
+    return taken, [*one, *wrapped]
+
+
+def test_the_hostile_profile_has_every_field_that_holds_text() -> None:
+    numbers = {"nodes", "cpus_per_task", "throttle", "cells_per_task", "max_array_size", "max_requeues"}
+    assert {*_hostile_profile("x")[1]} | numbers | {"prologue"} == {*Profile.model_fields}  # a prologue is shell
+
+
+def test_hostile_values_do_nothing(manifest: Manifest, tmp_path: Path) -> None:
+    def attempt(index: int) -> list[str]:
+        value, folder = HOSTILE[index], tmp_path / str(index)
+        settings, _ = _hostile_profile(value)
+        for name in ("time", "mem", "mem_per_cpu", "job_name", "interface", "mail_type", "signal", "exclusive"):
+            assert name not in settings, (name, value)  # these hold no free text at all
+        venv = settings.pop("venv", None)
+        if "apptainer" not in settings:
+            settings.pop("apptainer_options", None)
+        short_enough = "temp" in settings
+        if short_enough:
+            settings["temp"] = str(folder / "t")[-40:] if len(str(folder / "t")) <= 40 else "/tmp"  # noqa: S108
+        made = Export(manifest, profile(**settings), "array", tmp_path / "root" / value.replace("/", "_").strip()
+                      if value.isprintable() else None)  # fmt: skip
+        write(made, folder / "x")
+        canary, stand_ins = folder / "canary", Stubs(folder / "stubs")
+        (stand_ins.folder / "sleep").symlink_to("/bin/true")  # for there are many
+        for script in (TRAIN, AGGREGATE, SUBMIT) if index % 4 == 0 else (TRAIN,):
+            _, said = stand_ins.run(folder / "x" / script, C=str(canary), SLURM_JOB_ID=f"17{os.getpid()}{index}")
+            assert "syntax error" not in said, (value, script)
+            for line in (folder / "x" / script).read_text().splitlines():
+                if line.startswith("#SBATCH"):
+                    _sbatch_reads(line)
+        calls = stand_ins.calls()
+        if "command" in settings and "apptainer" in settings and "env" in settings:
+            [train] = [call for call in calls if call[0] == "apptainer" and "--part" in call]
+            assert train[:5] == ["apptainer", "exec", *settings.get("apptainer_options", []), value, "space-dist"][:5]
+            assert value in train
+            text = (folder / "x" / TRAIN).read_text()
+            directives = {_sbatch_reads(line) for line in text.splitlines() if line.startswith("#SBATCH")}
+            assert {f"--comment={value}", f"--partition={value}", f"--licenses={value}"} <= directives
+        if venv is not None and index % 5 == 0:
+            write(Export(manifest, profile(venv=venv), "array"), folder / "v")
+            code, said = stand_ins.run(folder / "v" / TRAIN, C=str(canary), SLURM_JOB_ID=f"18{os.getpid()}{index}")
+            assert code == 1, said
+            assert "cannot activate" in said
+        assert not canary.exists(), value
+        return [*settings]
+
+    with ThreadPoolExecutor(2) as pool:
+        taken = list(pool.map(attempt, range(len(HOSTILE))))
+    # printable values that do not begin with a hyphen are taken, and quoted; the others never get anywhere
+    assert sum("comment" in names for names in taken) > 150
+    shutil.rmtree(tmp_path)
+
+
+def test_a_profile_line_is_one_line() -> None:
+    for name in ("prologue", "extra", "command", "apptainer_options", "modules"):
+        for value in ("a\nb", "a\rb", "\x1b[2J", "a\0b", "a\u2028b"):
+            with pytest.raises(ValueError, match="one line of printable characters"):
+                profile(**{name: [value], **({"apptainer": "x"} if name == "apptainer_options" else {})})
+
+
+@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
+def test_bash_and_shellcheck_object_to_no_script(manifest: Manifest, tmp_path: Path) -> None:
+    chance = random.Random(0)
+    files = []
+    for number in range(12):
+        options = _everything().model_dump(exclude_unset=True)
+        kept = {name: value for name, value in options.items() if chance.random() < 0.5}
+        if "apptainer" not in kept:
+            kept.pop("apptainer_options", None)
+        if chance.random() < 0.3:
+            kept.pop("conda", None)
+            kept["venv"] = "/a folder/it's"
+        mode: Mode = chance.choice(MODES)
+        if mode == "array":
+            kept |= {"cells_per_task": chance.randint(1, 4), "max_array_size": chance.choice([2, 1001])}
+        root = chance.choice([None, Path("/scratch/it's mine")])
+        folder = write(Export(manifest, profile(**kept), mode, root), tmp_path / str(number))
+        files += [folder / name for name in (TRAIN, AGGREGATE, SUBMIT)]
+    for example in EXAMPLES.glob("*/*.s*"):
+        files.append(example)
+    for file in files:
+        subprocess.run(["bash", "-n", file], check=True)
+    found = subprocess.run(["shellcheck", *files], capture_output=True, text=True)
+    assert found.stdout + found.stderr == ""
+    found = subprocess.run(["shellcheck", *(ROOT / "tests/slurm").glob("*.sh")], capture_output=True, text=True)
+    assert found.stdout + found.stderr == ""
+
+
+# ---- what a task does -----------------------------------------------------------------------------------------------
+
+
+def test_a_requeued_jobs_runs_were_preempted_and_others_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = {"slurm_job": "17", "restarts": 0}
+    assert unheard(here).cause is Cause.KILLED  # nobody here is of SLURM
+    monkeypatch.setenv("SLURM_JOB_ID", "17")
+    assert slurm_job() == here
+    assert unheard(here).cause is Cause.KILLED  # it was this very job that lost it
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert unheard(here).cause is Cause.PREEMPTED
+    assert unheard({"slurm_job": "18", "restarts": 0}).cause is Cause.KILLED
+    assert unheard({}).cause is Cause.KILLED
+
+
+class Idle:
+    """An executor that must never be asked to start anything."""
+
+    def room(self) -> int:
+        return 1
+
+    def start(self, run: Run, attempt: int) -> None:
+        raise AssertionError((run, attempt))
+
+    def poll(self) -> list[tuple[Run, Ended | None]]:
+        return []
+
+    def stop(self) -> None:
+        pass
+
+    def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - it has none
+        return []
+
+
+def test_a_task_obeys_the_users_stop_and_only_the_whole_grid_ends_it(
+    grid: Grid, manifest: Manifest, tmp_path: Path
+) -> None:
+    place = adopt(grid, tmp_path)
+    place.stop_file.touch()
+    task = Conductor(place, manifest, manifest.runs()[:1], Idle(), stop_requested=lambda: None)
+    with pytest.raises(Interrupted, match="the grid's file `stop`"):
+        task.conduct()
+    assert place.stop_file.exists()
+    quiet = dataclasses.replace(manifest, tracking=manifest.tracking.model_copy(update={"uri": None}))
+    with working_on(place, quiet, wait=False, stop_requested=lambda: None, say=print):
+        assert not place.stop_file.exists()
+
+
+def test_tasks_may_freeze_their_grid_all_at_once(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        places = list(pool.map(lambda _: adopt(grid, tmp_path / "root"), range(32)))
+    assert {place.folder for place in places} == {tmp_path / "root" / manifest.name}
+    assert places[0].manifest() == manifest
+    assert places[0].instance_files(manifest) == grid.instance_files(manifest)
+
+
+# ---- what the scripts do --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("code", "extra", "requeued", "said"),
+    [
+        (0, {}, False, ""),
+        (1, {}, False, ""),
+        (2, {}, False, ""),
+        (3, {}, False, ""),
+        (75, {}, True, "requeued for the 1. time"),
+        (75, {"SLURM_RESTART_COUNT": "3"}, True, "requeued for the 4. time"),
+        (75, {"SLURM_RESTART_COUNT": "4"}, False, "not requeued for more than 4 times"),
+    ],
+)
+def test_a_task_goes_back_into_the_queue_only_if_interrupted(
+    code: int, extra: dict[str, str], requeued: bool, said: str, manifest: Manifest, stubs: Stubs, tmp_path: Path,
+    short: str,
+) -> None:  # fmt: skip
+    folder = write(Export(manifest, profile(max_requeues=4, temp=short), "array"), tmp_path / "x")
+    got, text = stubs.run(folder / TRAIN, STUB_CODE=str(code), **extra)
+    assert got == code
+    assert said in text
+    calls = stubs.calls()
+    assert [call[1:] for call in calls if call[0] == "scontrol"] == ([["requeue", "7_0"]] if requeued else [])
+    assert list((tmp_path / "node").iterdir()) == []
+
+
+def test_a_users_stop_is_respected(manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str) -> None:
+    folder = write(Export(manifest, profile(temp=short), "array"), tmp_path / "x")
+    (folder / "stop").touch()
+    code, said = stubs.run(folder / TRAIN, STUB_CODE="75")
+    assert code == 75
+    assert "stopped by its user" in said
+    assert stubs.calls("scontrol") == []
+    assert stubs.run(folder / SUBMIT)[0] == 0  # which means: go on
+    assert not (folder / "stop").exists()
+
+
+def _await(path: Path) -> None:
+    until = time.monotonic() + 30
+    while not path.exists():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(("number", "requeued"), [(signal.SIGUSR1, True), (signal.SIGTERM, False)])
+def test_a_signal_becomes_a_flag_file(
+    number: signal.Signals, requeued: bool, manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+) -> None:
+    folder = write(Export(manifest, profile(temp=short), "array"), tmp_path / "x")
+    waits = tmp_path / "waits"
+    process = stubs.start(folder / TRAIN, STUB_WAITS=str(waits), STUB_FLAG=f"{short}/r17/stop", STUB_CODE="75")
+    _await(waits)
+    for _ in range(20):  # it may come more than once, at any moment
+        process.send_signal(number)
+        time.sleep(0.002)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 75, err
+    assert ("requeued" in out.split("checkpoints")[0]) is requeued
+    assert bool(stubs.calls("scontrol")) is requeued
+    assert list((tmp_path / "node").iterdir()) == []
+
+
+def test_a_signal_before_anything_runs_is_not_lost(
+    manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+) -> None:
+    folder = write(Export(manifest, profile(temp=short, modules=["slow"]), "array"), tmp_path / "x")
+    loading = tmp_path / "loading"
+    process = stubs.start(folder / TRAIN, STUB_LOADING=str(loading), STUB_WAITS=str(tmp_path / "w"),
+                          STUB_FLAG=f"{short}/r17/stop", STUB_CODE="75")  # fmt: skip
+    _await(loading)
+    process.send_signal(signal.SIGUSR1)
+    process.communicate(timeout=30)
+    assert process.returncode == 75
+    assert [call[1:] for call in stubs.calls("scontrol")] == [["requeue", "7_0"]]
+    assert not (tmp_path / "w").exists()  # the flag was there before the work began
+
+
+@pytest.mark.parametrize("submitted_from", ["elsewhere", "nowhere"])
+def test_a_task_in_a_wrong_folder_says_so(
+    submitted_from: str, manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+) -> None:
+    folder = write(Export(manifest, profile(temp=short), "array"), tmp_path / "x")
+    (tmp_path / "elsewhere").mkdir()
+    code, said = stubs.run(folder / TRAIN, SLURM_SUBMIT_DIR=str(tmp_path / submitted_from))
+    assert code == 2
+    assert ("holds no manifest.json" if submitted_from == "elsewhere" else "does not see") in said
+    assert stubs.calls("space-dist") == []
+
+
+@pytest.mark.parametrize(("per_task", "max_size", "throttle"), [(1, 1001, None), (4, 1001, 1), (1, 2, 2), (2, 2, None)])
+def test_every_run_is_in_exactly_one_task(
+    per_task: int, max_size: int, throttle: int | None, manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+) -> None:
+    site = profile(cells_per_task=per_task, max_array_size=max_size, throttle=throttle, temp=short)
+    folder = write(Export(manifest, site, "array"), tmp_path / "x")
+    code, said = stubs.run(folder / SUBMIT, "--partition=other")
+    assert code == 0, said
+    *trains, aggregate = stubs.calls("sbatch")
+    parts: list[int] = []
+    literal = re.search(r"^#SBATCH --array=(\S+)", (folder / TRAIN).read_text(), re.MULTILINE)
+    assert literal is not None
+    for number, call in enumerate(trains):
+        assert "--partition=other" in call
+        given = [option.partition("=")[2] for option in call if option.startswith("--array=")]
+        span, percent, limit = (given or [literal[1]])[0].partition("%")
+        assert (percent, limit) == (("%", str(throttle)) if throttle else ("", ""))
+        waits = [option for option in call if option.startswith("--dependency")]
+        assert waits == ([f"--dependency=afterany:{100 + number}"] if throttle and number else [])
+        last = int(span.removeprefix("0-"))
+        assert last < max_size
+        for index in range(last + 1):
+            stubs.run(folder / TRAIN, *call[call.index(TRAIN) + 1 :], SLURM_ARRAY_TASK_ID=str(index))
+            [task] = stubs.calls("space-dist")
+            first, _, end = task[task.index("--part") + 1].partition("-")
+            parts += range(int(first), min(int(end), 5) + 1)
+    assert parts == list(range(6))
+    jobs = ":".join(str(101 + number) for number in range(len(trains)))
+    assert aggregate == ["sbatch", "--parsable", f"--dependency=afterany:{jobs}", AGGREGATE]
+    assert (folder / JOBS).read_text().split("\n")[-2] == f"{101 + len(trains)} aggregate"
+
+
+def test_submission_is_all_or_nothing_and_happens_once(manifest: Manifest, stubs: Stubs, tmp_path: Path) -> None:
+    folder = write(Export(manifest, profile(max_array_size=2, output="out put/%x.out"), "array"), tmp_path / "x")
+    code, said = stubs.run(folder / SUBMIT, STUB_REFUSES="103")
+    assert code != 0
+    assert "cancelling what was submitted: 101 102" in said
+    assert [call[1:] for call in stubs.calls("scancel")] == [["101", "102"]]
+    assert not (folder / JOBS).exists()
+    assert stubs.run(folder / SUBMIT)[0] == 0
+    assert (folder / "out put").is_dir()
+    assert len(stubs.calls("sbatch")) == 4
+    code, said = stubs.run(folder / SUBMIT, STUB_QUEUE="103\n")
+    assert (code, "already in the queue, nothing to do: 103" in said) == (0, True)
+    assert stubs.calls("sbatch") == []
+
+
+def test_what_slurm_knows_is_asked_once(stubs: Stubs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in stubs.environment.items():
+        monkeypatch.setenv(name, value)
+    assert queue_of(tmp_path) is None
+    (tmp_path / JOBS).write_text("7 train\n8 train\n9 aggregate\nrm -rf train\n")
+    monkeypatch.setenv("STUB_QUEUE", "7|RUNNING|None\n7|RUNNING|None\n8|PENDING|Resources\n99|RUNNING|None\n")
+    monkeypatch.setenv("STUB_PAST", "7_1|RUNNING|0:0\n7_2|TIMEOUT|0:0\n7_3|FAILED|1:0\n")
+    found = queue_of(tmp_path)
+    assert found is not None
+    assert found.live == {"train running": 2, "train pending (Resources)": 1}
+    assert found.ended == {"train timeout": 1, "train failed (1:0)": 1}
+    assert found.in_words() == (
+        "SLURM jobs: train 7, 8; aggregate 9; 2 train running, 1 train pending (Resources); "
+        "ended: 1 train timeout, 1 train failed (1:0)"
+    )
+    assert [call[0] for call in stubs.calls()] == ["squeue", "sacct"]
+    monkeypatch.setenv("STUB_SACCT", "1")
+    assert "ended" not in queue_of(tmp_path).in_words()  # type: ignore[union-attr]
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert "squeue does not answer here" in queue_of(tmp_path).in_words()  # type: ignore[union-attr]
+
+
+def test_a_nodes_address_is_one_that_others_reach() -> None:
+    with pytest.raises(SpaceDistError, match=r"no IPv4 address on interface 'ib99'"):
+        address_facing("localhost", "ib99")
+    assert address_facing("localhost", "lo") == "127.0.0.1"  # whoever says so gets it

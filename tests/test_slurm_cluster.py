@@ -1,0 +1,291 @@
+"""Grids on a real Slurm of two nodes, which these tests start: preempted, out of time, failing, short of a node.
+
+Every test compares with `grid run` of the same grid here: the same `metrics.jsonl`, byte for byte.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from space_dist.config import to_yaml
+from space_dist.ledger import METRICS, Ledger
+from space_dist.manifest import Grid
+from space_dist.slurm import Export, Profile
+from space_dist.slurm.export import AGGREGATE, JOBS, render
+from tests.slurm.gated_env import GATE
+
+ROOT = Path(__file__).resolve().parent.parent
+HERE = ROOT / "tests/slurm"
+pytestmark = [pytest.mark.slurm, pytest.mark.timeout(600)]
+PATIENCE = 240.0  # seconds
+KINDS = ({"kind": "space"}, {"kind": "round_robin"}, {"kind": "random_growth"}, {"kind": "space", "kappa": 2})
+
+
+@dataclass
+class Slurm:
+    """A Slurm of its own. Node n1's /var/tmp is folder/tmp.n1 here, and nobody else's."""
+
+    folder: Path
+
+    def ask(self, *command: str) -> str:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=self.environment)
+        assert done.returncode == 0, (command, done.stdout, done.stderr)
+        return done.stdout
+
+    @property
+    def environment(self) -> dict[str, str]:
+        ours = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "RAY_"))}
+        return {**ours, "SLURM_CONF": str(self.folder / "slurm.conf"), "PYTHONPATH": str(ROOT)}
+
+    def job(self, job: str) -> dict[str, str]:
+        """What scontrol tells of a job, or of one element of an array."""
+        words = self.ask("scontrol", "-o", "show", "job", job).splitlines()[0].split()
+        return {name: value for name, _, value in (word.partition("=") for word in words)}
+
+    def node_holder(self, number: int) -> int:
+        return int((self.folder / f"run/n{number}.host.pid").read_text())
+
+    def left_on(self, number: int) -> list[str]:
+        """Files of jobs on a node, and processes beside the node's own."""
+        files = [path.name for path in (self.folder / f"tmp.n{number}").iterdir()]
+        holder = self.node_holder(number)
+        [init] = Path(f"/proc/{holder}/task/{holder}/children").read_text().split()
+        space = Path(f"/proc/{init}/ns/pid").readlink()
+        for process in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if process.name.isdecimal() and (process / "ns/pid").readlink() == space:
+                    words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+                    if words and not words.startswith(("slurmd", "bash -c", "slurmstepd")):
+                        files.append(words)
+        shared = [path.name for path in Path(f"/proc/{init}/root/dev/shm").iterdir() if path.name != "slurmd.pid"]
+        return [*files, *shared]
+
+
+@pytest.fixture(scope="module")
+def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
+    installed = subprocess.run([HERE / "install.sh"], capture_output=True, text=True, timeout=300)
+    if installed.returncode:
+        pytest.skip(f"Slurm cannot be installed here: {installed.stderr.strip().splitlines()[-1]}")
+    probe = (
+        "unshare --pid --fork --mount --net --uts --ipc true && ip link add spprobe type bridge && ip link del spprobe"
+    )
+    refused = subprocess.run(["bash", "-c", f"PATH=$PATH:/sbin:/usr/sbin; {probe}"], capture_output=True, text=True)
+    if refused.returncode:
+        pytest.skip(
+            f"Slurm's two nodes need namespaces and a bridge, which this machine refuses: {refused.stderr.strip()}"
+        )
+    found = Slurm(tmp_path_factory.mktemp("slurm"))
+    try:
+        up = subprocess.run([HERE / "up.sh", found.folder], capture_output=True, text=True, timeout=120)
+        assert up.returncode == 0, up.stdout + up.stderr
+        yield found
+    finally:
+        subprocess.run([HERE / "down.sh", found.folder], capture_output=True, timeout=120)
+
+
+def space_dist(*arguments: object, slurm: Slurm | None = None) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)} if slurm is None else slurm.environment
+    done = subprocess.run(
+        [sys.executable, "-m", "space_dist.cli", *map(str, arguments)],
+        capture_output=True, text=True, timeout=2 * PATIENCE, env=environment, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def write_grid(folder: Path, name: str, *, seeds: tuple[int, ...], **more: object) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for split, targets in (("train", (-0.8, -0.3, 0.2, 0.7)), ("test", (-0.6, 0.5))):
+        rows = "".join(f"{index},{target}\n" for index, target in enumerate(targets))
+        (folder / f"{split}.csv").write_text("id,target\n" + rows)
+    (folder / "run.yaml").write_text(to_yaml({
+        "name": "base", "env": {"id": "tests.slurm.gated_env:make"},
+        "instances": {"train": "train.csv", "test": "test.csv"}, "curriculum": {"kind": "space"},
+        "learner": {"kind": "ppo", "n_steps": 512, "n_epochs": 1, "net_arch": [16]},
+        "rollout": {"shards": 1, "slots": 1}, "budget": {"steps": 8192}, "evaluation": {"every_steps": 4096},
+        "checkpoint": {"every_rounds": 1},
+    }))  # fmt: skip
+    (folder / f"{name}.yaml").write_text(to_yaml({
+        "name": name, "extends": "run.yaml", "seeds": list(seeds), "tracking": {"uri": None},
+        "resources": {"grace_seconds": 20.0}, **more,
+    }))  # fmt: skip
+    return folder / f"{name}.yaml"
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Grid:
+    """Eight runs, done by `grid run` here."""
+    folder = tmp_path_factory.mktemp("here")
+    grid = write_grid(folder, "eight", seeds=(0, 1), grid={"curriculum": list(KINDS)})
+    space_dist("grid", "run", grid, "--root", folder / "runs")
+    return Grid(folder / "runs/eight")
+
+
+def export(
+    grid: Path, out: Path, gate: Path, *options: object, python_path: str = str(ROOT), slurm: Slurm | None = None,
+    **more: object,
+) -> Path:  # fmt: skip
+    profile = out.with_suffix(".yaml")
+    profile.write_text(to_yaml({
+        "mem": 1500, "temp": "/var/tmp", "signal": {"lead_seconds": 115},  # noqa: S108 - the nodes' own
+        "command": [sys.executable, "-m", "space_dist.cli"],
+        "env": {"PYTHONPATH": python_path, GATE: str(gate)}, **more,
+    }))  # fmt: skip
+    space_dist("slurm", "export", grid, "--out", out, "--profile", profile, *options, slurm=slurm)
+    return out
+
+
+def await_(what: Callable[[], bool], why: str, folder: Path) -> None:
+    until = time.monotonic() + PATIENCE
+    while not what():
+        if time.monotonic() > until:
+            logs = "\n".join(f"== {log}\n{log.read_text()[-3000:]}" for log in sorted(folder.glob("logs/*")))
+            pytest.fail(f"waited for {PATIENCE:.0f} s: {why}\n{logs}")
+        time.sleep(0.3)
+
+
+def submitted(slurm: Slurm, folder: Path) -> tuple[str, str]:
+    """Ids of the training and the aggregating job, just submitted."""
+    space_dist("slurm", "submit", folder, slurm=slurm)
+    train, aggregate = [line.split()[0] for line in (folder / JOBS).read_text().splitlines()]
+    return train, aggregate
+
+
+def await_end(slurm: Slurm, job: str, folder: Path) -> str:
+    """Its state in the end, and what it has said."""
+    over = ("COMPLETED", "FAILED", "CANCELLED", "TIMEOUT", "NODE_FAIL")
+    await_(lambda: slurm.job(job)["JobState"] in over, f"job {job} to end", folder)
+    return slurm.job(job)["JobState"]
+
+
+def under_way(ledger: Ledger) -> bool:
+    """Whether a run has made a checkpoint, and is not done."""
+    with contextlib.suppress(Exception):
+        return ledger.status().checkpoint is not None and ledger.status().state == "running"
+    return False
+
+
+def assert_same_results(folder: Path, reference: Grid) -> None:
+    runs = reference.manifest().runs()
+    assert Grid(folder).manifest().runs_digest == reference.manifest().runs_digest
+    for run in runs:
+        ours = (Grid(folder).ledger(run).folder / METRICS).read_bytes()
+        assert ours == (reference.ledger(run).folder / METRICS).read_bytes(), run.title
+    assert len(runs) == 8
+
+
+def hosts(folder: Path) -> set[str]:
+    rows = [json.loads(line) for file in folder.glob("*/s*/attempts.jsonl") for line in file.read_text().splitlines()]
+    return {row["where"]["host"] for row in rows if row["event"] == "begin"}
+
+
+def test_an_array_survives_preemption_and_its_time_limit(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    gate.touch()  # runs are slow until all that is to happen has happened
+    # Exported, and then copied elsewhere, as a user would: with nothing but what is in the folder.
+    made = export(
+        reference.folder, tmp_path / "out", gate, "--cells-per-task", 2, "--throttle", 3, "--check", slurm=slurm
+    )
+    folder = tmp_path / "else where" / "grid"
+    shutil.copytree(made, folder)
+    shutil.rmtree(made)
+    train, aggregate = submitted(slurm, folder)
+    assert "already in the queue" in space_dist("slurm", "submit", folder, slurm=slurm)
+    grid, runs = Grid(folder), reference.manifest().runs()
+    names = [f"{train}_{element}" for element in range(4)]
+
+    def await_run(element: int) -> None:
+        ledgers = [grid.ledger(run) for run in runs[2 * element : 2 * element + 2]]
+        await_(lambda: any(map(under_way, ledgers)), f"element {element} to be under way", folder)
+
+    for element in (0, 1, 2):
+        await_run(element)
+    assert slurm.job(names[3])["JobState"] == "PENDING"  # the throttle
+    hours, minutes, seconds = map(int, slurm.job(names[2])["RunTime"].split(":"))
+    limit = (3600 * hours + 60 * minutes + seconds + 110) // 60  # so that its end is near all of a sudden
+    slurm.ask("scontrol", "update", f"JobId={names[2]}", f"TimeLimit={limit}")
+    slurm.ask("scontrol", "requeue", names[0])
+    slurm.ask("scontrol", "requeue", names[1])
+    await_run(3)
+    slurm.ask("scancel", "--batch", "--signal=USR1", names[3])
+    for name in names:
+        await_(lambda name=name: slurm.job(name).get("Restarts") == "1", f"{name} to be requeued", folder)
+    slurm.ask("scontrol", "update", f"JobId={names[2]}", "TimeLimit=UNLIMITED")
+    gate.unlink()
+    assert await_end(slurm, aggregate, folder) == "COMPLETED"
+    assert [slurm.job(name)["JobState"] for name in names] == ["COMPLETED"] * 4
+    said = (folder / f"logs/eight-aggregate-{aggregate}.out").read_text()
+    assert "eight: 8 of 8 runs done" in said
+    assert any((folder / "report").iterdir())
+    assert_same_results(folder, reference)
+    for node in (1, 2):
+        await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
+
+
+def test_a_failing_cell_blocks_nothing_and_is_named(slurm: Slurm, tmp_path: Path) -> None:
+    kwargs = {"env.kwargs": [{"fails": True}, {"fails": False}]}
+    grid = write_grid(tmp_path / "written", "two", seeds=(0,), grid=kwargs)
+    folder = export(grid, tmp_path / "two", tmp_path / "no_gate", "--cells-per-task", 2)
+    train, aggregate = submitted(slurm, folder)
+    assert await_end(slurm, aggregate, folder) == "FAILED"  # it says that the grid is not complete
+    assert slurm.job(aggregate)["ExitCode"] == "1:0"
+    assert slurm.job(f"{train}_0")["JobState"] == "FAILED"
+    said = (folder / f"logs/two-aggregate-{aggregate}.out").read_text()
+    assert "1 of 2 runs done, 1 failed" in said
+    assert "fails=true, seed 0" in said
+    assert "this environment was made to fail" in said
+    assert any((folder / "report").iterdir())
+
+
+def test_one_ray_over_two_nodes_survives_the_loss_of_one(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    gate.touch()
+    folder = export(
+        reference.folder, tmp_path / "grid", gate, "--mode", "cluster", "--check", slurm=slurm,
+        python_path=f"{HERE / 'short_lease'}:{ROOT}",
+    )  # fmt: skip
+    train, aggregate = submitted(slurm, folder)
+    grid = Grid(folder)
+
+    def running() -> int:
+        return sum(under_way(grid.ledger(run)) for run in reference.manifest().runs())
+
+    await_(lambda: running() == 2, "two runs to be under way", folder)
+    assert hosts(folder) == {"n1", "n2"}
+    os.kill(slurm.node_holder(2), signal.SIGKILL)
+    await_(lambda: slurm.job(train).get("Restarts") == "1", "the job to be requeued", folder)
+    gate.unlink()
+    subprocess.run([HERE / "up.sh", slurm.folder, "node", "2"], check=True, timeout=60)
+    assert await_end(slurm, aggregate, folder) == "COMPLETED"
+    assert slurm.job(train)["JobState"] == "COMPLETED"
+    assert "eight: 8 of 8 runs done" in (folder / f"logs/eight-aggregate-{aggregate}.out").read_text()
+    assert_same_results(folder, reference)
+    for node in (1, 2):
+        await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
+
+
+def test_sbatch_reads_hostile_values_as_text(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
+    for value in ('a "b" \\c # d', "$(touch canary) `touch canary`", "it's; touch canary #", "#x"):
+        made = Export(reference.manifest(), Profile(comment=value), "array")
+        (tmp_path / AGGREGATE).write_text(render(made)[AGGREGATE])
+        held = subprocess.run(
+            ["sbatch", "--parsable", "--hold", AGGREGATE], cwd=tmp_path, env=slurm.environment, text=True,
+            capture_output=True, check=True, timeout=60,
+        )  # fmt: skip
+        job = held.stdout.strip()
+        shown = slurm.ask("scontrol", "show", "job", job)
+        slurm.ask("scancel", job)
+        assert f"Comment={value}" in [line.strip() for line in shown.splitlines()], shown
+    assert list(tmp_path.glob("**/canary")) == []
