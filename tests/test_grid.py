@@ -542,3 +542,11 @@ def test_settings_of_a_run_in_a_grid_cannot_be_its_own_pusher(one: tuple[Grid, M
     assert (config.tracking.uri, config.tracking.live, config.tracking.experiment) == (
         "http://127.0.0.1:1", False, "small",
     )  # fmt: skip
+
+
+def test_deadlines_of_a_grid_are_those_of_its_runs(tmp_path: Path) -> None:
+    resources = {"workers": 2, "memory_mb": 500, "grace_seconds": 3.0, "room_seconds": 7.0, "late_seconds": 2.0,
+                 "late_factor": 5.0, "first_answer_seconds": 50.0}  # fmt: skip
+    made = plan(write_grid(tmp_path, resources=resources), tmp_path / "runs")
+    config = made.grid.run_config(made.manifest, made.manifest.runs()[0], address="auto").resources
+    assert config.model_dump() == {key: resources[key] for key in resources if key != "memory_mb"} | {"address": "auto"}
