@@ -32,6 +32,7 @@ from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
 from space_dist.standing import Attempts, Cause, Ended, Standing
+from space_dist.supervisor import ray_answers
 
 log = logging.getLogger("space_dist")
 
@@ -92,7 +93,8 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
     try:
         yield context.address_info.get("webui_url") or ""  # type: ignore[attr-defined]
     finally:
-        ray.shutdown()
+        if ray_answers(context.address_info["gcs_address"]):  # type: ignore[attr-defined]
+            ray.shutdown()  # which would end this process at once, before it has said why
 
 
 def _room_for(manifest: Manifest, max_parallel: int | None) -> int:

@@ -32,7 +32,7 @@ from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.standing import Attempts, Cause, Ended
-from space_dist.supervisor import STOPPED_SECONDS, Task
+from space_dist.supervisor import STOPPED_SECONDS, Task, ray_answers
 
 log = logging.getLogger("space_dist")
 
@@ -143,7 +143,7 @@ class Pool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for slot in self._slots:
+        for slot in self._slots if ray_answers(self._address) else ():
             with contextlib.suppress(RayError):
                 ray.kill(slot.actor)
         self._nonce.remove()
@@ -183,6 +183,11 @@ class Pool:
                     self._listen(slot)
             except RayActorError as error:
                 _refuse_start(error)
+                if not ray_answers(self._address):
+                    raise SpaceDistError(
+                        f"the Ray cluster at {self._address} is gone. What is done stays done; once there is one "
+                        "again, the same command goes on from the last checkpoints"
+                    ) from error
                 log.warning("lost a worker of the pool: %s", str(error).splitlines()[0][:200])
                 lost = self._lost(slot)
                 self._slots[index] = self._hire()

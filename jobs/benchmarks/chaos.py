@@ -95,7 +95,6 @@ class Result:
     ends: Counter[str] = field(default_factory=Counter)  # how attempts ended
     submissions: int = 0
     seconds: float = 0.0
-    reference_seconds: float = 0.0
 
 
 def plan(kinds: Sequence[str], count: int, steps: int, seed: int) -> list[Fault]:
@@ -143,21 +142,17 @@ def rehearse(
     }  # fmt: skip
     result = Result(runs=runs)
     try:
-        with (
-            TrackingServer(folder, environment, folder / "server.log") as server,
-            RayHead(folder / "ray", AT_A_TIME * 2, environment, folder / "head.log") as head,
-        ):
-            start = time.monotonic()
-            reference = _alone(folder, runs, steps, environment)
-            result.reference_seconds = time.monotonic() - start
-            say(f"left alone: {runs} runs of {steps:,} steps in {result.reference_seconds:.0f} s")
+        with contextlib.ExitStack() as stack:
+            server = stack.enter_context(TrackingServer(folder, environment, folder / "server.log"))
+            head = stack.enter_context(RayHead(folder / "ray", AT_A_TIME * 2, environment, folder / "head.log"))
+            alone = stack.enter_context(_alone(folder, runs, steps, environment))
             rehearsal = _Rehearsal(folder, _grid_file(folder, "chaos", runs, steps, server.address), head, server,
                                    mark, result, say)  # fmt: skip
             start = time.monotonic()
             try:
                 rehearsal.run(plan(kinds, count, runs * steps, seed))
                 result.seconds = time.monotonic() - start
-                rehearsal.check(reference)
+                rehearsal.check(_finished(alone, folder))
             finally:
                 rehearsal.end()
         left = _left(mark)
@@ -196,15 +191,30 @@ def _grid_file(folder: Path, name: str, runs: int, steps: int, uri: str | None) 
     return path
 
 
-def _alone(folder: Path, runs: int, steps: int, environment: Mapping[str, str]) -> Grid:
-    """The grid without faults, actors and MLflow."""
+@contextlib.contextmanager
+def _alone(
+    folder: Path, runs: int, steps: int, environment: Mapping[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:  # fmt: skip
+    """The grid without faults, actors and MLflow, worked on at the same time."""
     command = [
         sys.executable, "-m", "space_dist.cli", "grid", "run", str(_grid_file(folder, "alone", runs, steps, None)),
-        "--root", str(folder / "alone"), "--max-parallel", str(AT_A_TIME),
+        "--root", str(folder / "alone"), "--max-parallel", "1",
     ]  # fmt: skip
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SpaceDistError(f"the grid left alone did not complete: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+    with (folder / "alone.log").open("wb") as output:
+        process = subprocess.Popen(
+            command, env=dict(environment), stdin=subprocess.DEVNULL, stdout=output, stderr=output
+        )  # fmt: skip
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def _finished(alone: subprocess.Popen[bytes], folder: Path) -> Grid:
+    if alone.wait():
+        said = (folder / "alone.log").read_text(errors="replace")
+        raise SpaceDistError(f"the grid left alone did not complete: {said[-3000:]}")
     return Grid(folder / "alone/chaos")
 
 
