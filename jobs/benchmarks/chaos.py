@@ -3,7 +3,8 @@
 A grid of runs with rollout and curriculum actors is submitted to a Ray cluster and mirrored to an MLflow server. A
 fault falls once the runs have together committed so many steps, plus some seconds, both seeded: so that faults
 spread over the whole work however fast the machine is. It counts only if it hit a live process of a run in the middle
-of its work; then everything that was at work must get on before the next one falls.
+of its work. Everything that was at work then must get on; parts of one run are hit one after another, so that each
+shows that it can be recovered from, while other runs and the parts that all share are hit meanwhile.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ KINDS = (
     "stop driver", "kill supervisor", "stop supervisor", "kill pool worker", "stop pool worker", "kill conductor",
     "kill submitter", "kill Ray head", "kill tracking server",
 )  # fmt: skip
+OF_ALL = ("conductor", "submitter", "Ray head", "tracking server")  # parts that all runs share
 AT_A_TIME = 2  # runs, each with a driver, a rollout actor and a curriculum actor
 _FIRST, _LAST = 0.03, 0.9  # of all steps: when the first and the last fault may fall
 _MOST_DELAY, _MOST_PAUSE = 2.0, 3.0  # seconds: after the step count that calls for a fault; before a restart
@@ -231,6 +233,23 @@ class _Live:
     driver: psutil.Process
 
 
+@dataclass(frozen=True)
+class _Open:
+    """A fault that fell, and is not known to be recovered from. moved: of `live`, who must go on in new processes."""
+
+    fault: Fault
+    whose: str
+    start: float
+    victims: Sequence[psutil.Process]
+    live: Sequence[_Live]
+    moved: Sequence[_Live]
+    hurt: Sequence[Run]
+
+    def over(self, has_got_on: Callable[[_Live, bool], bool]) -> bool:
+        """The victims are gone, and whatever was at work has got on."""
+        return not any(map(_is_live, self.victims)) and all(has_got_on(one, one in self.moved) for one in self.live)
+
+
 class _Rehearsal:
     """The grid at work under faults."""
 
@@ -244,6 +263,7 @@ class _Rehearsal:
         self._runs: list[Run] = []
         self._submitter: subprocess.Popen[bytes] | None = None
         self._expected = 0  # ends of submitters that faults explain
+        self._open: list[_Open] = []
         self._began = time.monotonic()
 
     # ---- the course of things ----
@@ -251,27 +271,40 @@ class _Rehearsal:
     def run(self, faults: Sequence[Fault]) -> None:
         """All faults, and the rest of the work."""
         self._submit()
-        for number, fault in enumerate(faults, 1):
-            while self._steps() < fault.after_steps:
-                self._keep_submitted()
-                time.sleep(0.1)
+        for fault in faults:
+            self._wait(lambda fault=fault: self._steps() >= fault.after_steps)  # type: ignore[misc]
             time.sleep(fault.delay)
-            hit = self._strike(fault)
-            if hit is None:
+            if not self._strike(fault):
                 self._result.faults.append(f"no target for {fault.kind!r} was found in the middle of its work")
-                self._say(f"{number:3d} {fault.kind}: no target")
-            else:
-                self._result.hits.append(hit)
-                seconds = "not recovered" if hit.seconds is None else f"{hit.seconds:5.1f} s"
-                self._say(f"{number:3d} {hit.at:5.0f} s  {fault.kind:22s} {hit.run:20s} {seconds}")
-                if hit.seconds is None:
-                    self._result.faults.append(f"not recovered within {_RECOVERY_SECONDS:.0f} s: {fault.kind}")
-        if not until(self._over, _RECOVERY_SECONDS + 60.0 * len(self._runs), 0.3):
+                self._say(f"        {fault.kind}: no target")
+        if not self._wait(lambda: self._submitter is not None and self._submitter.poll() == 0):
             self._result.faults.append("the grid did not complete")
+        self._wait(lambda: not self._open)
 
-    def _over(self) -> bool:
-        self._keep_submitted()
-        return self._submitter is not None and self._submitter.poll() == 0
+    def _wait(self, condition: Callable[[], bool]) -> bool:
+        """Keep everything going meanwhile; False if the condition does not come true."""
+
+        def come() -> bool:
+            self._keep_submitted()
+            self._look_at_open()
+            return condition()
+
+        return until(come, _RECOVERY_SECONDS + 60.0 * max(1, len(self._runs)))
+
+    def _look_at_open(self) -> None:
+        """Notice which faults are recovered from by now."""
+        for one in list(self._open):
+            seconds = time.monotonic() - one.start
+            if recovered := one.over(self._has_got_on):
+                self._result.hits.append(Hit(one.fault, one.whose, one.start - self._began, seconds))
+            elif seconds > _RECOVERY_SECONDS:
+                self._result.hits.append(Hit(one.fault, one.whose, one.start - self._began, None))
+                self._result.faults.append(f"not recovered within {seconds:.0f} s: {one.fault.kind}, {one.whose}")
+            else:
+                continue
+            self._open.remove(one)
+            self._say(f"{len(self._result.hits):3d} {one.start - self._began:5.0f} s  {one.fault.kind:22s} "
+                      f"{one.whose:18s} {f'{seconds:5.1f} s' if recovered else 'not recovered'}")  # fmt: skip
 
     def end(self) -> None:
         """Whoever still looks on need not."""
@@ -356,50 +389,49 @@ class _Rehearsal:
 
     # ---- faults ----
 
-    def _strike(self, fault: Fault) -> Hit | None:
+    def _strike(self, fault: Fault) -> bool:
+        """Find a target and hit it. What a run still has to recover from must not be hidden by the next fault."""
         deadline = time.monotonic() + _SEARCH_SECONDS
         while time.monotonic() < deadline and not all(map(self._done, self._all())):
             self._keep_submitted()
-            live = self._live()
-            if live:
-                chosen = live[int(fault.choice * len(live))]
+            self._look_at_open()
+            live, _, name = self._live(), *fault.kind.split(" ", 1)
+            hurt = {run.key for one in self._open for run in one.hurt}
+            free = [one for one in live if name in OF_ALL or one.run.key not in hurt]
+            if free:
                 try:
-                    return self._hit(fault, chosen, live)
+                    self._hit(fault, free[int(fault.choice * len(free))], live)
                 except (_Missed, psutil.Error):
                     self._result.misses[fault.kind] += 1
+                else:
+                    return True
             time.sleep(0.5)
-        return None
+        return False
 
-    def _hit(self, fault: Fault, chosen: _Live, live: Sequence[_Live]) -> Hit:
-        verb, _, victim_name = fault.kind.partition(" ")
-        victims, moved, restart = self._victims(victim_name, chosen, live)
-        if not all(_is_live(victim) for victim in victims):
+    def _hit(self, fault: Fault, chosen: _Live, live: Sequence[_Live]) -> None:
+        verb, name = fault.kind.split(" ", 1)
+        victims, moved, restart = self._victims(name, chosen, live)
+        if not victims or not all(map(_is_live, victims)):
             raise _Missed
         start = time.monotonic()
         for victim in victims:
             victim.send_signal(signal.SIGSTOP if verb == "stop" else signal.SIGKILL)
+        if name in ("conductor", "submitter", "Ray head"):
+            self._expected += 1
         if not until(lambda: all(_is_hit(victim, verb) for victim in victims), 5.0, 0.02):
             raise _Missed
-        of_all = victim_name in ("submitter", "conductor", "Ray head", "tracking server")
-        for one in live if of_all else [chosen]:
-            if (status := self._status(one.run)) is None or status.state != "running":
-                raise _Missed  # it ended just then
-        if victim_name in ("conductor", "submitter", "Ray head"):
-            self._expected += 1
+        counts = any(
+            (status := self._status(one.run)) is not None and status.state == "running"
+            for one in (live if name in OF_ALL else [chosen])
+        )
         if restart is not None:
             time.sleep(fault.pause)
             restart()
-
-        def recovered() -> bool:
-            self._keep_submitted()
-            return not any(_is_live(victim) for victim in victims) and all(
-                self._has_got_on(one, one in moved) for one in live
-            )
-
-        came = until(recovered, _RECOVERY_SECONDS)
-        seconds = time.monotonic() - start
-        whose = "all" if of_all else chosen.run.title
-        return Hit(fault, whose, start - self._began, seconds if came else None)
+        if not counts:  # it ended just then
+            raise _Missed
+        whose = "all" if name in OF_ALL else chosen.run.title
+        hurt = [] if name in OF_ALL else [chosen.run]
+        self._open.append(_Open(fault, whose, start, victims, live, moved, hurt))
 
     def _has_got_on(self, before: _Live, moved: bool) -> bool:
         """Two rounds further, or done; by another process if the one before is to be gone."""
