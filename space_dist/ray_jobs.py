@@ -27,6 +27,7 @@ import ray
 import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
+from space_dist.distributed import remove_session
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
@@ -74,6 +75,7 @@ def conduct(
 @contextlib.contextmanager
 def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Iterator[str]:
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
+    own = None
     try:
         if address == "local":
             cores = len(os.sched_getaffinity(0))
@@ -83,6 +85,7 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
                 address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False,
                 logging_level=logging.ERROR, configure_logging=False, object_store_memory=_OBJECT_STORE_BYTES,
             )  # fmt: skip
+            own = context.address_info["session_dir"]  # type: ignore[attr-defined]
         else:
             context = ray.init(
                 address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
@@ -95,6 +98,7 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
     finally:
         if ray_answers(context.address_info["gcs_address"]):  # type: ignore[attr-defined]
             ray.shutdown()  # which would end this process at once, before it has said why
+            remove_session(own)
 
 
 def _room_for(manifest: Manifest, max_parallel: int | None) -> int:

@@ -161,7 +161,7 @@ def rehearse(
         until(lambda: not _left(mark), _LEFT_SECONDS)
         if left := _left(mark):
             result.faults.append(f"left behind in the end: {left}")
-        if names := sorted(path.name for path in (folder / "tmp").iterdir()):
+        if names := _temporary(folder / "tmp"):
             result.faults.append(f"temporary files were left behind: {', '.join(names)}")
     finally:
         for process in _marked(mark):
@@ -172,6 +172,16 @@ def rehearse(
         else:
             shutil.rmtree(folder, ignore_errors=True)
     return result
+
+
+def _temporary(folder: Path) -> list[str]:
+    """What our processes have left where temporary files lie.
+
+    torch keeps a cache there, MLflow's killed servers leave what multiprocessing made, and Ray what is of no session.
+    """
+    others = ("ray", "session_latest", "prom_metrics_service_discovery.json", "torchinductor_", "pymp-")
+    found = sorted(path.name for path in [*folder.iterdir(), *(folder / "ray").glob("*")])
+    return [name for name in found if not name.startswith(others)]
 
 
 def _grid_file(folder: Path, name: str, runs: int, steps: int, uri: str | None) -> Path:
