@@ -225,7 +225,8 @@ class Conductor:
         self._stop_requested, self._observe = stop_requested, observe
         self._waiting: list[tuple[float, Run]] = []  # not before that time, by the monotonic clock
         self._live: dict[str, Run] = {}
-        self._steps: dict[str, int] = {}  # of a run when its attempt began
+        self._begun: dict[str, bool] = {}  # whether a waiting run did, by its key
+        self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._overview = Overview(len(runs))
 
@@ -268,9 +269,9 @@ class Conductor:
         if standing.condition == "running":
             self._elsewhere[run.key] = run
         elif standing.condition == "waiting":
-            self._steps[run.key] = standing.steps
-            # What has begun goes on before anything new begins.
-            self._waiting.insert(0 if standing.attempts else len(self._waiting), (time.monotonic() + delay, run))
+            self._begun[run.key], self._steps[run.key] = standing.attempts > 0, standing.steps
+            self._waiting.append((time.monotonic() + delay, run))
+            self._waiting.sort(key=lambda entry: not self._begun[entry[1].key])  # which goes on before anything begins
         elif standing.condition == "failed":
             self._overview.failed += 1
             log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)

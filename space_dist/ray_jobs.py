@@ -97,7 +97,7 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
         yield context.address_info.get("webui_url") or ""  # type: ignore[attr-defined]
     finally:
         if ray_answers(context.address_info["gcs_address"]):  # type: ignore[attr-defined]
-            ray.shutdown()  # which would end this process at once, before it has said why
+            ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
             remove_session(own)
 
 

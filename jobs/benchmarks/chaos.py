@@ -54,7 +54,7 @@ AT_A_TIME = 2  # runs, each with a driver, a rollout actor and a curriculum acto
 _FIRST, _LAST = 0.03, 0.9  # of all steps: when the first and the last fault may fall
 _MOST_DELAY, _MOST_PAUSE = 2.0, 3.0  # seconds: after the step count that calls for a fault; before a restart
 _FURTHER_ROUNDS = 2  # that a run must commit after a fault: the first may have been computed when it fell
-_SEARCH_SECONDS = 60.0  # for a target
+_SEARCH_SECONDS = 240.0  # for a target
 _RECOVERY_SECONDS = 240.0
 _LEFT_SECONDS = 45.0  # for what was told to end
 _MARK = "SPACE_DIST_CHAOS"  # in the environment of every process that belongs to one rehearsal
@@ -274,6 +274,7 @@ class _Rehearsal:
         self._submitter: subprocess.Popen[bytes] | None = None
         self._expected = 0  # ends of submitters that faults explain
         self._open: list[_Open] = []
+        self._first_seen: dict[tuple[str, psutil.Process], int] = {}  # the round in which a run's process was
         self._began = time.monotonic()
 
     # ---- the course of things ----
@@ -383,13 +384,15 @@ class _Rehearsal:
         return None
 
     def _live(self) -> list[_Live]:
-        """Runs in the middle of their work."""
+        """Runs in the middle of their work: their process has committed, and not only started."""
         found = []
         for run in self._all():
             status = self._status(run)
             if status is not None and status.state == "running" and 0 < status.steps < status.budget_steps:
                 driver = self._driver(self._grid.ledger(run))
-                if driver is not None and _is(driver, "space_dist.supervisor"):
+                if driver is None or not _is(driver, "space_dist.supervisor"):
+                    continue
+                if status.round > self._first_seen.setdefault((run.key, driver), status.round):
                     found.append(_Live(run, status.round, driver))
         return found
 
