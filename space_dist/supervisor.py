@@ -95,8 +95,8 @@ class Supervisor:
             return Busy(None, child.report().get("message", ""))
         ended = Ended(None)
         if code:
-            ended = watch.reason or _lost_with_ray(code, child, manifest, task.address)
-            ended = ended or _why(code, child, grid, _system_kills() > out_of_memory_before)
+            lost = watch.reason or _lost_with_ray(code, child, manifest, task.address)
+            ended = lost or _why(code, child, grid, _system_kills() > out_of_memory_before)
         if ended.cause in (Cause.CRASH, Cause.CONFIG_ERROR):
             lines = last_lines(ledger.folder / OUTPUT)
             ended = Ended(ended.cause, "\n".join([*filter(None, [ended.detail]), *lines][-6:]))

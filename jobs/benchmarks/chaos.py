@@ -565,7 +565,7 @@ def _points(ledger: Ledger) -> Iterator[tuple[str, int, int, float]]:
         numbers = {f"{section}/{key}": value for section in ("train", "test", "rollout", "learner", "curriculum")
                    for key, value in row.get(section, {}).items()}  # fmt: skip
         if row["kind"] == "iteration":
-            numbers |= {key: row[key] for key in ("iteration", "round", "episodes", "episodes_cut")}
+            numbers |= {key: row[key] for key in ("iteration", "round", "episodes", "episodes_cut", "gradient_steps")}
         numbers["timing/steps_per_second"] = timing["steps_per_second"]
         for key, value in numbers.items():
             if isinstance(value, int | float):
@@ -615,7 +615,7 @@ def _left(mark: str) -> str:
     for process in _marked(mark):
         with contextlib.suppress(psutil.Error):
             line = " ".join(process.cmdline())
-            ours = ("space_dist", "ray::RolloutActor", "ray::CurriculumActor", "ray::PoolWorker")
+            ours = ("-m space_dist", "ray::RolloutActor", "ray::CurriculumActor", "ray::PoolWorker")
             if any(word in line for word in ours):
                 left.append(f"{process.pid} {line[:150]}")
     return "; ".join(left)
