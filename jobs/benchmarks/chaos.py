@@ -115,7 +115,7 @@ def plan(kinds: Sequence[str], count: int, steps: int, seed: int) -> list[Fault]
 def chaos(
     faults: Annotated[int, typer.Option(min=1, help="Faults that must hit.")] = 50,
     runs: Annotated[int, typer.Option(min=1, help="Runs of the grid.")] = 8,
-    steps: Annotated[int, typer.Option(min=5_120, help="Environment steps of each run.")] = 81_920,
+    steps: Annotated[int, typer.Option(min=5_120, help="Environment steps of each run.")] = 122_880,
     seed: Annotated[int, typer.Option(min=0, help="Of kinds, moments and victims.")] = 0,
     kind: Annotated[Optional[list[str]], typer.Option(help="Only these kinds of faults; repeatable.")] = None,  # noqa: UP045
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
@@ -286,7 +286,9 @@ class _Rehearsal:
             self._wait(lambda fault=fault: self._steps() >= fault.after_steps)  # type: ignore[misc]
             time.sleep(fault.delay)
             if not self._strike(fault):
-                self._result.faults.append(f"no target for {fault.kind!r} was found in the middle of its work")
+                self._result.faults.append(
+                    f"no target for {fault.kind!r} was found in the middle of its work (--steps makes more of it)"
+                )
                 self._say(f"        {fault.kind}: no target")
         if not self._wait(lambda: self._submitter is not None and self._submitter.poll() == 0):
             self._result.faults.append("the grid did not complete")

@@ -1,4 +1,4 @@
-"""A short rehearsal of `jobs/benchmark.py chaos`: one fault of each of six kinds over a small grid."""
+"""A short rehearsal of `jobs/benchmark.py chaos`: one fault of each of five kinds over a small grid."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.chaos import KINDS, plan, rehearse
 
-BOUNDED = (
-    "kill rollout actor", "stop curriculum actor", "kill driver", "kill conductor", "kill Ray head",
-    "kill tracking server",
-)  # fmt: skip
+BOUNDED = ("kill rollout actor", "stop curriculum actor", "kill driver", "kill Ray head", "kill tracking server")
 
 
 def test_the_plan_is_seeded_and_even() -> None:
@@ -39,4 +36,4 @@ def test_a_grid_under_faults_is_the_grid_left_alone() -> None:
     assert sorted(hit.fault.kind for hit in result.hits) == sorted(BOUNDED)
     assert all(hit.seconds is not None for hit in result.hits)
     assert result.identical == 4
-    assert result.submissions >= 3
+    assert result.submissions >= 2
