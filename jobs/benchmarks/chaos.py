@@ -90,11 +90,11 @@ class Result:
     """What a rehearsal has shown."""
 
     hits: list[Hit] = field(default_factory=list)
-    misses: Counter[str] = field(default_factory=Counter)
+    misses: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)  # what is not as it must be, one sentence each
     runs: int = 0
     identical: int = 0
-    ends: Counter[str] = field(default_factory=Counter)  # how attempts ended
+    ends: dict[str, int] = field(default_factory=dict)  # how attempts ended
     submissions: int = 0
     seconds: float = 0.0
 
@@ -417,7 +417,7 @@ class _Rehearsal:
                 try:
                     self._hit(fault, free[int(fault.choice * len(free))], live)
                 except (_Missed, psutil.Error):
-                    self._result.misses[fault.kind] += 1
+                    self._result.misses[fault.kind] = self._result.misses.get(fault.kind, 0) + 1
                 else:
                     return True
             time.sleep(0.5)
@@ -529,7 +529,8 @@ class _Rehearsal:
             self._result.identical += not differ
             for row in Attempts(self._grid.ledger(run)).rows():
                 if row["event"] == "end":
-                    self._result.ends[row["cause"] or "done"] += 1
+                    cause = row["cause"] or "done"
+                    self._result.ends[cause] = self._result.ends.get(cause, 0) + 1
         faults += self._mirror_faults()
         faults += [f"left behind: {path.relative_to(self._folder)}" for path in sorted(self._grid.folder.rglob("*"))
                    if path.name.startswith(".") or path.name == "stop"]  # fmt: skip
@@ -631,7 +632,7 @@ def _show(result: Result) -> None:
         hits = [hit for hit in result.hits if hit.fault.kind == kind]
         seconds = [hit.seconds for hit in hits if hit.seconds is not None]
         median = f"{statistics.median(seconds):.1f} s" if seconds else "—"
-        table.add_row(kind, str(len(hits)), str(len(seconds)), median, str(result.misses[kind]))
+        table.add_row(kind, str(len(hits)), str(len(seconds)), median, str(result.misses.get(kind, 0)))
     console.print(table)
     console.print(
         f"{result.identical} of {result.runs} runs are, byte for byte, those of the grid left alone. "
