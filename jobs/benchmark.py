@@ -5,13 +5,20 @@ from __future__ import annotations
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
 import typer
-from benchmarks import checkpoint, curricula, curriculum, envs, grid
+from benchmarks import chaos, checkpoint, curricula, curriculum, envs, grid
 from rich.console import Console
 
 from space_dist.errors import SpaceDistError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-for _benchmark in (checkpoint.checkpoint, curricula.curricula, curriculum.curriculum, envs.envs, grid.grid):
+for _benchmark in (
+    chaos.chaos,
+    checkpoint.checkpoint,
+    curricula.curricula,
+    curriculum.curriculum,
+    envs.envs,
+    grid.grid,
+):
     app.command()(_benchmark)
 
 

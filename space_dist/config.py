@@ -677,15 +677,9 @@ class TrackingConfig(Section):
     """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
 
 
-class ResourcesConfig(Section):
-    """What the run may use. Decides no result."""
+class Patience(Section):
+    """How long a run waits for room on Ray, and for answers of its actors."""
 
-    workers: int = Field(default=1, ge=0, le=4096)
-    """Ray rollout actors; 0: everything in this process, without Ray."""
-    address: str = Field(default="local", min_length=1, max_length=300)
-    """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
-    grace_seconds: float = Field(default=25.0, gt=0.0)
-    """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
     room_seconds: float = Field(default=120.0, gt=0.0)
     """How long to wait for Ray to have room for all workers at once, and, when nodes are lost, for any of them."""
     late_factor: float = Field(default=20.0, ge=1.0)
@@ -694,6 +688,17 @@ class ResourcesConfig(Section):
     """... but none before it has taken so many seconds."""
     first_answer_seconds: float = Field(default=900.0, gt=0.0)
     """The same limit for an actor's start, and for calls of a kind that has not been answered yet."""
+
+
+class ResourcesConfig(Patience):
+    """What the run may use. Decides no result."""
+
+    workers: int = Field(default=1, ge=0, le=4096)
+    """Ray rollout actors; 0: everything in this process, without Ray."""
+    address: str = Field(default="local", min_length=1, max_length=300)
+    """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
+    grace_seconds: float = Field(default=25.0, gt=0.0)
+    """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
 
 
 class RunConfig(Section):

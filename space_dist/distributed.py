@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import shutil
 import statistics
 import time
 from collections import defaultdict, deque
@@ -33,7 +34,7 @@ from threadpoolctl import threadpool_limits
 
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
@@ -131,16 +132,17 @@ class RayCluster:
         self._unanswered: list[_Call] = []
         self._submitted = 0
         self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
+        self._session: str | None = None  # the folder of a Ray of our own
         self._clock = 0.0  # seconds spent waiting: a driver that was itself stopped, or busy, blames nobody
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
         try:
             if resources.address == "local":
-                ray.init(
+                self._session = ray.init(
                     address="local", num_cpus=resources.workers + 1, include_dashboard=False, log_to_driver=False,
                     logging_level=logging.ERROR, object_store_memory=_OBJECT_STORE_BYTES, configure_logging=False,
-                )  # fmt: skip
+                ).address_info["session_dir"]  # type: ignore[attr-defined]  # fmt: skip
             else:
                 ray.init(
                     address=resources.address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
@@ -170,6 +172,8 @@ class RayCluster:
                 ray.kill(actor)
             self._leave_room()
         ray.shutdown()
+        if kind is None or issubclass(kind, Interrupted):
+            remove_session(self._session)
 
     def put(self, value: object) -> Handle:
         """See `cluster.Cluster`."""
@@ -442,6 +446,12 @@ class RayCluster:
             f"(resources.room_seconds) none was found; the cluster has {total:.0f} CPUs, {free:.0f} of them free. "
             "Fewer fit with --workers"
         )
+
+
+def remove_session(folder: str | None) -> None:
+    """Remove what a Ray of our own has left of its sockets and logs: Ray itself never does."""
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _name(seat: int) -> str:

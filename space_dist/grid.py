@@ -37,7 +37,7 @@ log = logging.getLogger("space_dist")
 STOP_ASKED = "the grid's file `stop`"
 _TICK_SECONDS = 0.2
 _ELSEWHERE_SECONDS = 2.0
-_FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run is tried again; doubled each time
+_FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0
 
 
@@ -236,6 +236,8 @@ class Conductor:
         self._stop_requested, self._observe = stop_requested, observe
         self._waiting: list[tuple[float, Run]] = []  # not before that time, by the monotonic clock
         self._live: dict[str, Run] = {}
+        self._begun: dict[str, bool] = {}  # whether a waiting run did, by its key
+        self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._overview = Overview(len(runs))
 
@@ -277,7 +279,9 @@ class Conductor:
         if standing.condition == "running":
             self._elsewhere[run.key] = run
         elif standing.condition == "waiting":
+            self._begun[run.key], self._steps[run.key] = standing.attempts > 0, standing.steps
             self._waiting.append((time.monotonic() + delay, run))
+            self._waiting.sort(key=lambda entry: not self._begun[entry[1].key])  # which goes on before anything begins
         elif standing.condition == "failed":
             self._overview.failed += 1
             log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
@@ -315,7 +319,14 @@ class Conductor:
         again = may_retry(ended.cause, history.ends, self._manifest.retry)
         log.warning("%s: %s%s: %s", run.title, ended.cause.in_words, ", trying again" if again else "", ended.detail)
         self._overview.message = f"{run.title}: {ended.cause.in_words}"
-        self._place(run, min(_MAX_DELAY, _FIRST_DELAY * 2 ** max(0, history.ends.get(ended.cause, 0) - 1)))
+        delay = min(_MAX_DELAY, _FIRST_DELAY * 2 ** max(0, history.ends.get(ended.cause, 0) - 1))
+        self._place(run, 0.0 if self._has_got_on(run) else delay)
+
+    def _has_got_on(self, run: Run) -> bool:
+        """Whether its last attempt has committed anything: then it is not the run that makes its attempts fail."""
+        with contextlib.suppress(LedgerError):
+            return self._grid.ledger(run).status().steps > self._steps.get(run.key, 0)
+        return False
 
     def _asked_to_stop(self) -> str | None:
         return STOP_ASKED if self._grid.stop_file.exists() else self._stop_requested()

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Self
 from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
-from space_dist.config import NAME, ResourcesConfig, RunConfig, Section
+from space_dist.config import NAME, Patience, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.ledger import Ledger, atomic_write, owner_alive
 
@@ -55,7 +55,7 @@ class SeedRange(Section):
     """How many seeds."""
 
 
-class RunResources(Section):
+class RunResources(Patience):
     """What each run may use. Decides no result."""
 
     workers: int = Field(default=0, ge=0, le=1024)
@@ -461,14 +461,13 @@ class Grid:
 
     def run_config(self, manifest: Manifest, run: Run, *, address: str = "local") -> RunConfig:
         """What a run is to do, with the grid's own instance files, here."""
-        resources = ResourcesConfig(
-            workers=manifest.resources.workers, address=address, grace_seconds=manifest.resources.grace_seconds
-        )
+        shared = ResourcesConfig.model_fields.keys() & RunResources.model_fields.keys()
+        resources = {**manifest.resources.model_dump(mode="json", include=shared), "address": address}
         data = {
             **run.cell.config,
             "seed": run.seed,
             "instances": configs.from_folder(run.cell.config["instances"], self.folder),
-            "resources": resources.model_dump(mode="json"),
+            "resources": resources,
             "tracking": {"uri": manifest.tracking.uri, "experiment": manifest.experiment, "live": False},
         }
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")

@@ -27,11 +27,13 @@ import ray
 import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
+from space_dist.distributed import remove_session
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
 from space_dist.standing import Attempts, Cause, Ended, Standing
+from space_dist.supervisor import ray_answers
 
 log = logging.getLogger("space_dist")
 
@@ -78,6 +80,7 @@ def conduct(
 @contextlib.contextmanager
 def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Iterator[str]:
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
+    own = None
     try:
         if address == "local":
             cores = _cores()
@@ -87,6 +90,7 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
                 address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False,
                 logging_level=logging.ERROR, configure_logging=False, object_store_memory=_OBJECT_STORE_BYTES,
             )  # fmt: skip
+            own = context.address_info["session_dir"]  # type: ignore[attr-defined]
         else:
             context = ray.init(
                 address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
@@ -97,7 +101,9 @@ def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Itera
     try:
         yield context.address_info.get("webui_url") or ""  # type: ignore[attr-defined]
     finally:
-        ray.shutdown()
+        if ray_answers(context.address_info["gcs_address"]):  # type: ignore[attr-defined]
+            ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
+            remove_session(own)
 
 
 def _cores() -> int:

@@ -29,9 +29,10 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from space_dist.errors import LedgerError, SpaceDistError
+from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.standing import Attempts, Cause, Ended
-from space_dist.supervisor import STOPPED_SECONDS, Task
+from space_dist.supervisor import STOPPED_SECONDS, Task, ray_answers
 
 log = logging.getLogger("space_dist")
 
@@ -39,6 +40,7 @@ _SIGN_SECONDS = 2.0
 _LATE_SECONDS = 30.0  # without an answer a worker is taken for lost
 _START_SECONDS = 120.0
 _NONCE = ".nonce-"
+_FORGOTTEN_SECONDS = 86_400.0
 
 
 class PoolWorker:
@@ -142,7 +144,7 @@ class Pool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for slot in self._slots:
+        for slot in self._slots if ray_answers(self._address) else ():
             with contextlib.suppress(RayError):
                 ray.kill(slot.actor)
         self._nonce.remove()
@@ -182,6 +184,11 @@ class Pool:
                     self._listen(slot)
             except RayActorError as error:
                 _refuse_start(error)
+                if not ray_answers(self._address):
+                    raise SpaceDistError(
+                        f"the Ray cluster at {self._address} is gone. What is done stays done; once there is one "
+                        "again, the same command goes on from the last checkpoints"
+                    ) from error
                 log.warning("lost a worker of the pool: %s", str(error).splitlines()[0][:200])
                 lost = self._lost(slot)
                 self._slots[index] = self._hire()
@@ -243,14 +250,28 @@ class Nonce:
     def place(self) -> None:
         """Raises LedgerError if the folder cannot be written."""
         try:
-            self._path.touch()
+            self._path.write_text(json.dumps(this_process()))
         except OSError as error:
             raise LedgerError(f"cannot write the grid's folder {self._path.parent}: {error.strerror}") from None
 
     def remove(self) -> None:
-        """Whatever happens."""
+        """Whatever happens; and with it those of conductors that were killed."""
         with contextlib.suppress(OSError):
             self._path.unlink()
+            for other in self._path.parent.glob(f"{_NONCE}*"):
+                if _abandoned(other):
+                    other.unlink()
+
+
+def _abandoned(nonce: Path) -> bool:
+    """Whether its conductor is dead; one that cannot be seen from here is believed to live for a day."""
+    owner: dict[str, Any] = {}
+    with contextlib.suppress(ValueError):  # torn by a kill
+        owner = json.loads(nonce.read_text())
+    here = this_process()
+    if all(here[key] and owner.get(key) == here[key] for key in ("boot_id", "pid_namespace")):
+        return not believed_alive(owner)
+    return time.time() - nonce.stat().st_mtime > _FORGOTTEN_SECONDS
 
 
 def refuse_other_folder(folder: Path, nonce: str) -> None:

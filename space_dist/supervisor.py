@@ -22,6 +22,7 @@ import dataclasses
 import json
 import select
 import signal
+import socket
 import sys
 import time
 import traceback
@@ -42,6 +43,7 @@ STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
 _LOOK_SECONDS = 0.1
 _SIGN_SECONDS = 5.0
 _KILL_SECONDS = 10.0  # after a run's grace time
+_LISTEN_SECONDS = 2.0
 _PDEATHSIG = 1  # prctl's
 
 
@@ -93,7 +95,8 @@ class Supervisor:
             return Busy(None, child.report().get("message", ""))
         ended = Ended(None)
         if code:
-            ended = watch.reason or _why(code, child, grid, _system_kills() > out_of_memory_before)
+            lost = watch.reason or _lost_with_ray(code, child, manifest, task.address)
+            ended = lost or _why(code, child, grid, _system_kills() > out_of_memory_before)
         if ended.cause in (Cause.CRASH, Cause.CONFIG_ERROR):
             lines = last_lines(ledger.folder / OUTPUT)
             ended = Ended(ended.cause, "\n".join([*filter(None, [ended.detail]), *lines][-6:]))
@@ -139,8 +142,10 @@ class _Child:
             if os.getppid() != parent:
                 os._exit(Interrupted.exit_code)
             code = _child_main(work, output, writing)
-        except BaseException:  # nothing may return into the parent's code
+        except BaseException as error:  # nothing may return into the parent's code
             traceback.print_exc()
+            with contextlib.suppress(OSError):
+                os.write(writing, json.dumps({"error": type(error).__name__}).encode())
         finally:
             with contextlib.suppress(Exception):
                 sys.stdout.flush()
@@ -239,6 +244,26 @@ class _Watch:
     def _end(self, reason: Ended) -> None:
         self.reason = self.reason or reason
         self.child.kill()
+
+
+def _lost_with_ray(code: int, child: _Child, manifest: Manifest, address: str) -> Ended | None:
+    """Ray ends a process at once, and without a word to it, when the Ray of its node is gone."""
+    silent = code == 1 and not child.report()
+    if manifest.resources.workers and (silent or (code == -signal.SIGABRT and not ray_answers(address))):
+        return Ended(Cause.NODE_LOST, "Ray on its node is gone, and the run with it")
+    return None
+
+
+def ray_answers(address: str) -> bool:
+    """Whether somebody listens at a Ray's address, HOST:PORT; Ray itself aborts a process that asks in vain."""
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal():
+        return True
+    try:
+        socket.create_connection((host, int(port)), timeout=_LISTEN_SECONDS).close()
+    except OSError:
+        return False
+    return True
 
 
 def _why(code: int, child: _Child, grid: Grid, system_killed: bool) -> Ended:

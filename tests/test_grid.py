@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import faulthandler
 import json
 import os
 import random
+import socket
 import subprocess
 import sys
 import time
@@ -15,6 +17,7 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist import supervisor
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.grid import Conductor, plan
 from space_dist.ledger import METRICS, Lock, Row
@@ -22,6 +25,7 @@ from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
 from space_dist.provenance import source_digest
 from space_dist.standing import Attempts, Cause, Ended, exit_code, last_lines, standing_of, standings
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
+from tests.test_report import continue_run, start_run
 
 CODE = "0" * 16
 
@@ -542,3 +546,82 @@ def test_settings_of_a_run_in_a_grid_cannot_be_its_own_pusher(one: tuple[Grid, M
     assert (config.tracking.uri, config.tracking.live, config.tracking.experiment) == (
         "http://127.0.0.1:1", False, "small",
     )  # fmt: skip
+
+
+def test_deadlines_of_a_grid_are_those_of_its_runs(tmp_path: Path) -> None:
+    resources = {"workers": 2, "memory_mb": 500, "grace_seconds": 3.0, "room_seconds": 7.0, "late_seconds": 2.0,
+                 "late_factor": 5.0, "first_answer_seconds": 50.0}  # fmt: skip
+    made = plan(write_grid(tmp_path, resources=resources), tmp_path / "runs")
+    config = made.grid.run_config(made.manifest, made.manifest.runs()[0], address="auto").resources
+    assert config.model_dump() == {key: resources[key] for key in resources if key != "memory_mb"} | {"address": "auto"}
+
+
+@pytest.mark.parametrize(
+    ("workers", "end", "listening", "cause"),
+    [
+        (1, "_exit", True, Cause.NODE_LOST), (0, "_exit", True, Cause.CRASH),
+        (1, "abort", False, Cause.NODE_LOST), (1, "abort", True, Cause.CRASH),
+    ],
+)  # fmt: skip
+def test_a_run_that_ray_took_with_it_is_lost_and_not_crashed(
+    workers: int, end: str, listening: bool, cause: Cause, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray's library ends the process of a driver by itself: with 1 and no word, or by SIGABRT."""
+    made = plan(write_grid(tmp_path, resources={"workers": workers}), tmp_path / "runs")
+    run = made.manifest.runs()[0]
+    with socket.socket() as port:
+        port.bind(("127.0.0.1", 0))
+        if listening:
+            port.listen()
+        address = f"127.0.0.1:{port.getsockname()[1]}"
+
+        def work(*_: object) -> None:
+            faulthandler.disable()  # pytest's
+            if end == "abort":
+                os.abort()
+            os._exit(1)
+
+        monkeypatch.setattr(supervisor, "_work", work)
+        task = supervisor.Task(str(made.grid.folder), run.cell.id, run.seed, 1, address)
+        assert supervisor.Supervisor().attempt(task, lambda: None).cause is cause
+
+
+def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
+    """And without delay if its last attempt got on; else after others had their chance."""
+    made = plan(write_grid(tmp_path), tmp_path / "runs")
+    runs = made.manifest.runs()
+    Attempts(made.grid.ledger(runs[2])).begin(1, {"pid": -1})
+    Attempts(made.grid.ledger(runs[2])).end(1, Ended(Cause.PREEMPTED))
+    started: list[Run] = []
+
+    class OneAtATime:
+        def __init__(self) -> None:
+            self.now: Run | None = None
+
+        def room(self) -> int:
+            return self.now is None
+
+        def start(self, run: Run, attempt: int) -> None:
+            self.now = run
+            started.append(run)
+            Attempts(made.grid.ledger(run)).begin(attempt, {})
+
+        def poll(self) -> list[tuple[Run, Ended | None]]:
+            run, self.now = self.now, None
+            if run is None:
+                return []
+            first = run is runs[0] and started.count(run) == 1
+            ended = Ended(Cause.KILLED if first else None)
+            Attempts(made.grid.ledger(run)).end(1, ended)
+            if first:  # it got on
+                start_run(made.grid.ledger(run).folder)
+                continue_run(made.grid.ledger(run), [0.0, 1.0], [[0]], state="running")
+            return [(run, ended)]
+
+        def stop(self) -> None: ...
+
+        def adopt(self, runs: Any) -> list[Run]:  # noqa: ARG002
+            return []
+
+    Conductor(made.grid, made.manifest, runs, OneAtATime(), stop_requested=lambda: None).conduct()
+    assert started == [runs[2], runs[0], runs[0], runs[1], runs[3]]

@@ -19,7 +19,8 @@ import psutil
 import pytest
 import requests
 
-from space_dist.ledger import METRICS
+from space_dist.launch import private_ray
+from space_dist.ledger import METRICS, this_process
 from space_dist.manifest import Grid, Run
 from space_dist.standing import Attempts
 from tests.grids import ROOT, write_grid
@@ -197,3 +198,20 @@ def test_a_dead_job_server_is_one_clear_sentence(cluster: RayCluster, tmp_path: 
     assert submit.returncode == 1
     assert "does not answer" in said
     assert "Traceback" not in said
+
+
+def test_the_nonces_of_killed_conductors_go_with_the_next_ones(tmp_path: Path) -> None:
+    private_ray()
+    from space_dist.ray_pool import Nonce, refuse_other_folder
+
+    for name, content in (("torn", ""), ("elsewhere", json.dumps(this_process() | {"boot_id": "another"})),
+                          ("dead", json.dumps(this_process() | {"started": 1})),
+                          ("alive", json.dumps(this_process()))):  # fmt: skip
+        (tmp_path / f".nonce-{name}").write_text(content)
+    (tmp_path / ".nonce-old").write_text("")
+    os.utime(tmp_path / ".nonce-old", (1e9, 1e9))
+    nonce = Nonce(Grid(tmp_path))
+    nonce.place()
+    refuse_other_folder(tmp_path, nonce.text)
+    nonce.remove()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".nonce-alive", ".nonce-elsewhere", ".nonce-torn"]

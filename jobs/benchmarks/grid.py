@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Optional
 
-import psutil
-import requests
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.servers import RayHead
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
 
@@ -42,8 +38,10 @@ def grid(
             "name": "short", "extends": str(ROOT / "configs/pointmass_space.yaml"),
             "set": {"budget.steps": 20480}, "seeds": {"count": runs}, "tracking": {"uri": None},
         }))  # fmt: skip
-        environment, address = stack.enter_context(_cluster())
-        seconds = {mode: _submit(path, folder / mode, address, mode, environment) for mode in ("pool", "jobs")}
+        sockets = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sd", dir="/tmp")))  # a short path
+        head = stack.enter_context(RayHead(sockets, CORES, os.environ, folder / "head.log"))
+        seconds = {mode: _submit(path, folder / mode, head.address, mode, head.environment)
+                   for mode in ("pool", "jobs")}  # fmt: skip
     ratio = seconds["pool"] / seconds["jobs"]
     table = Table(title=f"{runs} runs of 20,480 steps, two at a time, submission and start included")
     for column in ("", "wall time", "of the jobs'"):
@@ -69,40 +67,3 @@ def _submit(path: Path, root: Path, address: str, mode: str, environment: dict[s
     if done.returncode:
         raise SpaceDistError(f"the grid did not complete as {mode}: {done.stdout[-2000:]}{done.stderr[-2000:]}")
     return time.perf_counter() - start
-
-
-@contextmanager
-def _cluster() -> Iterator[tuple[dict[str, str], str]]:
-    """A Ray cluster of two CPUs on this machine, in a process group of its own."""
-    token, temp = secrets.token_hex(32), Path(tempfile.mkdtemp(prefix="sd", dir="/tmp"))
-    ports = [6400 + offset + secrets.randbelow(900) for offset in (0, 1000, 2000)]
-    binaries = Path(sys.executable).parent
-    environment = {
-        **os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token, "RAY_USAGE_STATS_ENABLED": "0",
-        "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}",
-    }  # fmt: skip
-    command = [
-        str(binaries / "ray"), "start", "--head", "--block", f"--num-cpus={CORES}", f"--port={ports[0]}",
-        "--dashboard-host=127.0.0.1", f"--dashboard-port={ports[1]}", f"--dashboard-agent-listen-port={ports[2]}",
-        "--object-store-memory=150000000", f"--temp-dir={temp}", "--disable-usage-stats",
-    ]  # fmt: skip
-    head = subprocess.Popen(
-        command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    address = f"http://127.0.0.1:{ports[1]}"
-    try:
-        for _ in range(300):
-            with suppress(requests.RequestException):
-                if requests.get(f"{address}/api/jobs/", headers={"Authorization": f"Bearer {token}"}, timeout=5).ok:
-                    break
-            time.sleep(0.3)
-        else:
-            raise SpaceDistError("Ray did not start")
-        yield environment, address
-    finally:
-        below = psutil.Process(head.pid).children(recursive=True) if head.poll() is None else []
-        os.killpg(head.pid, signal.SIGKILL)
-        for process in below:
-            with suppress(psutil.NoSuchProcess):
-                process.kill()
-        head.wait()
