@@ -157,18 +157,17 @@ def rehearse(
                 rehearsal.check(_finished(alone, folder))
             finally:
                 rehearsal.end()
-        left = _left(mark)
-        until(lambda: not _left(mark), _LEFT_SECONDS)
-        if left := _left(mark):
-            result.faults.append(f"left behind in the end: {left}")
+        until(lambda: not _marked(mark), _LEFT_SECONDS)
+        if left := _marked(mark):  # the servers have ended, too
+            result.faults.append(f"left behind in the end: {'; '.join(map(_in_words, left))}")
         if names := _temporary(folder / "tmp"):
             result.faults.append(f"temporary files were left behind: {', '.join(names)}")
     finally:
         for process in _marked(mark):
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
-        if result.faults and os.environ.get("SPACE_DIST_KEEP"):
-            say(f"kept: {folder}")
+        if result.faults:
+            say(f"kept, so that it can be looked into: {folder}")
         else:
             shutil.rmtree(folder, ignore_errors=True)
     return result
@@ -614,14 +613,15 @@ def _marked(mark: str) -> list[psutil.Process]:
 
 def _left(mark: str) -> str:
     """Processes of ours, or that work for us, in words; Ray's own, its idle workers and MLflow's are not."""
-    left = []
-    for process in _marked(mark):
-        with contextlib.suppress(psutil.Error):
-            line = " ".join(process.cmdline())
-            ours = ("-m space_dist", "ray::RolloutActor", "ray::CurriculumActor", "ray::PoolWorker")
-            if any(word in line for word in ours):
-                left.append(f"{process.pid} {line[:150]}")
-    return "; ".join(left)
+    ours = ("-m space_dist", "ray::RolloutActor", "ray::CurriculumActor", "ray::PoolWorker")
+    lines = map(_in_words, _marked(mark))
+    return "; ".join(line for line in lines if any(word in line for word in ours))
+
+
+def _in_words(process: psutil.Process) -> str:
+    with contextlib.suppress(psutil.Error):
+        return f"{process.pid} {' '.join(process.cmdline())[:150]}"
+    return f"{process.pid}"
 
 
 def _show(result: Result) -> None:

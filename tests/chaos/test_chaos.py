@@ -31,9 +31,9 @@ def test_the_plan_is_seeded_and_even() -> None:
 @pytest.mark.timeout(600)
 def test_a_grid_under_faults_is_the_grid_left_alone() -> None:
     said: list[str] = []
-    result = rehearse(runs=4, steps=20_480, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append)
+    result = rehearse(runs=3, steps=51_200, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append)
     assert not result.faults, "\n".join([*result.faults, *said])
     assert sorted(hit.fault.kind for hit in result.hits) == sorted(BOUNDED)
     assert all(hit.seconds is not None for hit in result.hits)
-    assert result.identical == 4
+    assert result.identical == 3
     assert result.submissions >= 2
