@@ -14,20 +14,20 @@ from mlflow import MlflowClient
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from space_dist import cli, tracking
+from space_dist import cli
 from space_dist import config as configs
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
 from space_dist.launch import policy_of
-from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, RunWriter
+from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, RunWriter, Status
 from space_dist.mazes import carve
 from space_dist.policy import MlpPolicy, to_arrays
 from space_dist.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.rollout import Worker
-from space_dist.tracking import sync
+from space_dist.tracking import runs, sync
 from space_dist.training import learner_of, make_setup
-from tests.test_report import finished_run
+from tests.test_report import finished_run, written
 
 BLUE, GREEN, RED = (0, 114, 178), (0, 158, 115), (213, 94, 0)
 
@@ -54,7 +54,10 @@ def run_of(
     ledger = Ledger(folder)
     with RunWriter(ledger) as writer:
         writer.write_config(configs.dump(config), sets[0].to_csv(), sets[1].to_csv())
+        status = Status("running", "drawn", 0, 0, 2048, 0, started_at=1.0, updated_at=1.0)
+        writer.set_status(status)
         writer.write_model(*to_arrays(policy))
+        writer.set_status(dataclasses.replace(status, state="done"))
     return ledger
 
 
@@ -209,13 +212,13 @@ def test_a_finished_runs_episodes_are_mirrored_and_a_failure_costs_a_warning(
 ) -> None:
     """The rows of a finished run, with the config, the sets and the policy of the corridor's."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tracking, "_DRAW_SECONDS", 250.0)  # however slow the machine is
+    monkeypatch.setattr(runs, "_DRAW_SECONDS", 250.0)  # however slow the machine is
     uri = f"sqlite:///{tmp_path / 'store' / 'mlflow.db'}"
     ledgers = [finished_run(tmp_path / f"run{number}", 1.0, seed=number) for number in range(2)]
     for ledger in ledgers:
         for name in ("config.yaml", "instances_train.csv", "instances_test.csv", "model.npz", "model.json"):
-            (ledger.folder / name).write_bytes((corridor.folder / name).read_bytes())
-    (ledgers[1].folder / "model.npz").write_bytes(b"no model")
+            written(ledger, name, (corridor.folder / name).read_bytes())
+    written(ledgers[1], "model.npz", b"no model")
     rows = [[(ledger.folder / name).read_bytes() for name in (METRICS, TIMING, CURRICULUM)] for ledger in ledgers]
     result = sync(ledgers, uri, "drawn")
     assert (result.runs, dict(result.failed)) == (2, {})

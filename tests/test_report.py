@@ -330,12 +330,13 @@ def test_runs_of_equal_settings_are_one_configuration_whatever_they_are_called(t
     assert [(found.label, len(found.runs)) for found in group(runs)] == [("monday", 2), ("tuesday", 1)]
 
 
-def written(ledger: Ledger, file: str, content: str) -> None:
+def written(ledger: Ledger, file: str, content: str | bytes) -> None:
     """Give a run another file, as if it had been started with it."""
-    (ledger.folder / file).write_text(content)
+    content = content.encode() if isinstance(content, str) else content
+    (ledger.folder / file).write_bytes(content)
     with RunWriter(ledger) as writer:
         writer.status = ledger.status()
-        sha256 = hashlib.sha256(content.encode()).hexdigest()
+        sha256 = hashlib.sha256(content).hexdigest()
         writer.set_status(dataclasses.replace(writer.status, files={**writer.status.files, file: [sha256]}))
 
 
