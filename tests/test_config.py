@@ -56,7 +56,7 @@ def ident(config: RunConfig, train: str = "t", test: str = "e") -> str:
     return identity(config, train, test)
 
 
-def attempted_elsewhere(path: Path, seconds: float = 5.0, memory: int = 2 << 30) -> str | None:
+def attempted_elsewhere(path: Path, seconds: float = 60.0, memory: int = 2 << 30) -> str | None:
     """`attempt` in a process of its own, which is killed when it takes longer, or more memory on top of ours."""
     read, write = os.pipe()
     child = os.fork()
