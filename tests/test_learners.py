@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -183,7 +184,7 @@ def one_ray() -> Iterator[None]:
 
     ray.init(address="local", num_cpus=5, include_dashboard=False, log_to_driver=False, object_store_memory=256 << 20)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray, "init", lambda **_: None)
+        patch.setattr(ray, "init", lambda **_: SimpleNamespace(address_info={"session_dir": None}))  # none of its own
         patch.setattr(ray, "shutdown", lambda: None)
         yield
     ray.shutdown()

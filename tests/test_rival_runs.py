@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -110,7 +111,7 @@ def one_ray() -> Iterator[None]:
         configure_logging=False,
     )  # fmt: skip
     patch = pytest.MonkeyPatch()
-    patch.setattr(ray, "init", lambda **_: None)
+    patch.setattr(ray, "init", lambda **_: SimpleNamespace(address_info={"session_dir": None}))  # none of its own
     patch.setattr(ray, "shutdown", lambda: None)
     yield
     patch.undo()
