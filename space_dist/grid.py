@@ -99,7 +99,7 @@ def _freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest
     """Returns the manifest that was there before. Tasks of a batch system may all do this at once."""
     try:
         grid.folder.mkdir(parents=True, exist_ok=True)
-        with (grid.folder / ".freezing").open("w") as lock:
+        with (grid.folder / "manifest.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             return _freeze_alone(grid, manifest, files)
     except OSError as error:
