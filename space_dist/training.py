@@ -9,7 +9,11 @@
         select   cluster.decide(state, evidence)         the next selection, from that and what else was asked for
     now and then: evaluate on all instances, and commit to the ledger
 
-The driver waits once per round, for the shards. What is asked for at the end of a round (decision, evaluation) is
+`Training.work` is a generator: it yields what it waits for, values (`Wait`) or an update (`Learn`), and is sent the
+answer. `Training.run` answers for one run; a population answers for many, whose shards are then collected, and whose
+updates are made, together.
+
+A run waits once per round, for the shards. What is asked for at the end of a round (decision, evaluation) is
 picked up at the next wait, or before a commit: `_settle`. Only where a curriculum probes instances does it wait for
 those episodes as well: how many steps they took decides whether the budget has room for another round. A run is a pure
 function of (config, seed).
@@ -22,9 +26,9 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +42,7 @@ from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
 from space_dist.learner import Arrays, Ensemble, Learner, Update, make_ensemble, make_learner, refuse_spaces
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
-from space_dist.policy import MlpPolicy, Policy, blind, to_arrays
+from space_dist.policy import MlpPolicy, Policy, Statistics, blind, to_arrays
 from space_dist.rollout import (
     CUT,
     Outcomes,
@@ -199,8 +203,28 @@ class _Pending:
     settle: Callable[[list[Any]], None]
 
 
+@dataclass(frozen=True)
+class Wait:
+    """A run needs the values of `handles`, as a list, to go on."""
+
+    handles: list[Handle]
+
+
+@dataclass(frozen=True)
+class Learn:
+    """A run needs its learner's `Update` on a round's shards, to go on. steps: of the run, with these."""
+
+    shards: list[Shard]
+    round: int
+    steps: int
+
+
+T = TypeVar("T")
+Work = Generator[Wait | Learn, Any, T]
+
+
 class Training:
-    """One run in progress. `run` is Algorithm 1; the rest keeps its books."""
+    """One run in progress. `work` is Algorithm 1; the rest keeps its books."""
 
     def __init__(
         self,
@@ -228,23 +252,38 @@ class Training:
 
     def run(self) -> None:
         """Train to the end of the budget. Raises Interrupted, after a commit, if asked to stop."""
+        work = self.work()
+        answer: Any = None
+        while True:
+            try:
+                request = work.send(answer)
+            except StopIteration:
+                return
+            if isinstance(request, Wait):
+                answer = self._cluster.get(request.handles)
+            else:
+                answer = self.learner.update(request.shards, round=request.round, steps=request.steps)
+
+    def work(self) -> Work[None]:
+        """What `run` does, as a generator: whoever advances it answers `Wait` and `Learn`."""
         run, cluster, config = self._run, self._cluster, self._config
         checkpoint = self._writer.restore()
-        policy = self._restore(checkpoint) if checkpoint else self._begin()
+        policy = self._restore(checkpoint) if checkpoint else (yield from self._begin())
         while not self._is_over():
-            shards: list[Shard] = self._wait_for(
+            shards: list[Shard] = yield from self._settle(
                 cluster.collect(policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version)
             )
-            steps = run.steps + sum(shard.steps for shard in shards)
-            self._account(shards, self._update(shards, steps))
+            scales = self.learner.statistics  # the ones that the round was collected under
+            update = yield Learn(shards, run.round, run.steps + sum(shard.steps for shard in shards))
+            self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
-                self._decide(policy)
+                yield from self._decide(policy)
             if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
                 self._evaluate(policy)
             self._show()
-            self._commit_if_due()
-        self._finish()
+            yield from self._commit_if_due()
+        yield from self._finish()
 
     def _is_over(self, reserved: int = 0) -> bool:
         """Whether another round, and `reserved` steps before it, would exceed the budget."""
@@ -254,16 +293,16 @@ class Training:
 
     # ---- the parts of an iteration ----
 
-    def _begin(self) -> Handle:
+    def _begin(self) -> Work[Handle]:
         cluster = self._cluster
         if self.learner.normalises:
-            self._probe()
+            yield from self._probe()
         policy = cluster.put(self.learner.policy(0))
         self._adopt(cluster.begin(cluster.start_values(policy)))
         self._evaluate(policy)
         return policy
 
-    def _probe(self) -> None:
+    def _probe(self) -> Work[None]:
         """One round of actions that ignore the observation gives the first scales; its steps count like any others."""
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
@@ -272,23 +311,21 @@ class Training:
         handles = cluster.collect(
             cluster.put(policy), cluster.put(selection), run.walk, round=PROBE, steps=0, version=selection.version
         )  # fmt: skip
-        shards: list[Shard] = cluster.get(handles)
+        shards: list[Shard] = yield Wait(handles)
         self.learner.observe(shards)
         run.steps += sum(shard.steps for shard in shards)
 
-    def _update(self, shards: list[Shard], steps: int) -> Update:
-        """Learn from a round; `steps`: of the run, with these shards."""
-        scales = self.learner.statistics  # the ones that the round was collected under
-        update = self.learner.update(shards, round=self._run.round, steps=steps)
+    def _with_ensemble(self, update: Update, shards: list[Shard], scales: Statistics) -> Update:
+        """The update, and what the ensemble, if there is one, learned from the same shards."""
         if self.ensemble is None:
             return update
         metrics = self.ensemble.update(shards, scales, round=self._run.round)
         return dataclasses.replace(update, metrics={**update.metrics, **metrics})
 
-    def _decide(self, policy: Handle) -> None:
+    def _decide(self, policy: Handle) -> Work[None]:
         """Gather what the curriculum asks for and let it choose; the answer is picked up at the next wait."""
         run, cluster = self._run, self._cluster
-        probes = self._probe_instances(policy)
+        probes = yield from self._probe_instances(policy)
         decision = cluster.decide(
             run.state, run.values, self._evidence(policy, probes),
             version=run.version, gradient_steps=run.gradient_steps,
@@ -306,7 +343,7 @@ class Training:
         run.version += 1
         run.rollouts, run.updates, run.seen, run.gradient_steps = [], [], [], 0
 
-    def _probe_instances(self, policy: Handle) -> list[Outcomes]:
+    def _probe_instances(self, policy: Handle) -> Work[list[Outcomes]]:
         """Run the probe episodes that the curriculum asks for, if any, and charge their steps to the budget.
 
         There are none where they, at their longest, would leave no room for another round.
@@ -315,7 +352,7 @@ class Training:
         indices = self._curriculum.probes(run.version)
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
-        outcomes: list[Outcomes] = self._settle(cluster.probe(policy, indices, version=run.version))
+        outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))
         run.steps += sum(int(part.lengths.sum()) for part in outcomes)
         return outcomes
 
@@ -412,13 +449,13 @@ class Training:
         run.steps += sum(shard.steps for shard in shards)
         run.episodes += sum(len(shard.episodes) for shard in shards)
 
-    def _finish(self) -> None:
+    def _finish(self) -> Work[None]:
         run = self._run
         if run.rollouts:  # the budget ended inside an iteration: its steps are told, its decision never falls
-            self._settle()
+            yield from self._settle()
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
             run.rollouts, run.updates, run.seen = [], [], []
-        self._commit("done")
+        yield from self._commit("done")
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
         self._writer.write_model(arrays, {**description, "context_visible": self._config.env.context_visible})
@@ -426,13 +463,10 @@ class Training:
 
     # ---- waiting, and the ledger ----
 
-    def _wait_for(self, handles: Sequence[Handle]) -> list[Any]:
-        """The one wait of a round: the shards, and whatever was asked for since the last one."""
-        return self._settle(handles)
-
-    def _settle(self, handles: Sequence[Handle] = ()) -> list[Any]:
+    def _settle(self, handles: Sequence[Handle] = ()) -> Work[list[Any]]:
+        """Wait for the values of `handles`, and for whatever was asked for since the last wait."""
         pending, self._run.pending = self._run.pending, []
-        answers = self._cluster.get([*handles, *(handle for one in pending for handle in one.handles)])
+        answers: list[Any] = yield Wait([*handles, *(handle for one in pending for handle in one.handles)])
         at = len(handles)
         for one in pending:
             one.settle(answers[at : at + len(one.handles)])
@@ -487,23 +521,23 @@ class Training:
         if rate is not None:
             self.progress.steps_per_second = rate
 
-    def _commit_if_due(self) -> None:
+    def _commit_if_due(self) -> Work[None]:
         reason = self._stop_requested()
         if reason is not None:
-            self._commit("interrupted", reason)
+            yield from self._commit("interrupted", reason)
             raise Interrupted(f"stopped by {reason} after {self._run.steps} steps; --resume continues")
         settings = self._config.checkpoint
         if (
             self._run.round - self._last_commit_round >= settings.every_rounds
             or time.monotonic() - self._last_commit_time >= settings.every_seconds
         ):
-            self._commit("running")
+            yield from self._commit("running")
 
-    def _commit(self, state: str, message: str | None = None) -> None:
-        self._settle()
+    def _commit(self, state: str, message: str | None = None) -> Work[None]:
+        yield from self._settle()
         # A run is done only once its model is written.
         status = self._new_status("running" if state == "done" else state, message)
-        self._writer.commit(self._save(), status)
+        self._writer.commit((yield from self._save()), status)
         self._last_commit_time, self._last_commit_round = time.monotonic(), self._run.round
 
     def _new_status(self, state: Any, message: str | None = None) -> Status:
@@ -512,11 +546,11 @@ class Training:
             updated_at=time.time(),
         )  # fmt: skip
 
-    def _save(self) -> Checkpoint:
+    def _save(self) -> Work[Checkpoint]:
         run = self._run
         arrays, learner = self.learner.save()
         arrays = {f"learner/{name}": array for name, array in arrays.items()}
-        state, values = self._cluster.get([run.state, run.values])
+        state, values = yield Wait([run.state, run.values])
         remembered, numbers = encode_state(state)
         arrays["values"] = values
         arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
