@@ -708,6 +708,10 @@ class RunConfig(Section):
     """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
     """The one number from which every random number of the run comes."""
+    engine: Literal["auto", "single", "population"] = "single"
+    """How updates are computed. single: by SB3 itself. population: the same losses for many runs of one shape at once
+    (PPO and TRPO with MlpPolicy); a grid puts such runs together, and one alone has the same bits. auto: population
+    where the learner allows it; decided when a grid is frozen or a run begins. Part of what a run is."""
     env: EnvConfig
     instances: InstancesConfig
     curriculum: CurriculumConfig

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import logging
 import math
 import time
@@ -40,7 +41,17 @@ from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
-from space_dist.learner import Arrays, Ensemble, Learner, Update, make_ensemble, make_learner, refuse_spaces
+from space_dist.learner import (
+    Arrays,
+    Ensemble,
+    Learner,
+    Update,
+    make_ensemble,
+    make_learner,
+    refuse_population,
+    refuse_spaces,
+    stack_key,
+)
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
 from space_dist.policy import MlpPolicy, Policy, Statistics, blind, to_arrays
 from space_dist.rollout import (
@@ -94,6 +105,8 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         )
     env = make_env(config)
     refuse_spaces(config.learner, env.observation_space, env.action_space)
+    if config.engine == "population":
+        refuse_population(config.learner, env.observation_space, env.action_space)
     if config.curriculum.ranks_by_start_value and _starts_alike(config, train):
         raise ConfigError(
             f"curriculum.kind: {config.curriculum.kind} ranks instances by the value of their start, but all instances "
@@ -214,6 +227,7 @@ class Wait:
 class Learn:
     """A run needs its learner's `Update` on a round's shards, to go on. steps: of the run, with these."""
 
+    learner: Learner
     shards: list[Shard]
     round: int
     steps: int
@@ -274,7 +288,7 @@ class Training:
                 cluster.collect(policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version)
             )
             scales = self.learner.statistics  # the ones that the round was collected under
-            update = yield Learn(shards, run.round, run.steps + sum(shard.steps for shard in shards))
+            update = yield Learn(self.learner, shards, run.round, run.steps + sum(shard.steps for shard in shards))
             self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
@@ -635,6 +649,27 @@ def total_steps(config: RunConfig, horizon: int) -> int:
     return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
 
 
+def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
+    """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
+    if config.engine != "auto":
+        return config
+    env, engine = make_env(config), "population" if can_share else "single"
+    try:
+        refuse_population(config.learner, env.observation_space, env.action_space)
+    except ConfigError:
+        engine = "single"
+    return config.model_copy(update={"engine": engine})
+
+
+def stack_of(config: RunConfig) -> str:
+    """`(16 hex digits)` equal for runs that may be members of one population; empty for those of no population."""
+    if config.engine != "population":
+        return ""
+    env = make_env(config)
+    key = (config.env.model_dump_json(), stack_key(config.learner, env.observation_space, env.action_space))
+    return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+
+
 def learner_of(config: RunConfig) -> Learner:
     """A config's learner with its initial networks."""
     env = make_env(config)
@@ -642,6 +677,7 @@ def learner_of(config: RunConfig) -> Learner:
         config.learner, env.observation_space, env.action_space,
         seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots,
         slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
+        population=config.engine == "population",
     )  # fmt: skip
 
 
