@@ -21,9 +21,10 @@ from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.policy import Policy, Statistics
 from space_dist.rollout import Shard
-from space_dist.seeding import Purpose, global_generators, seed_sequence
+from space_dist.seeding import Purpose, global_generators, global_seeds
 
 Arrays = dict[str, NDArray[Any]]
+NOT_A_NUMBER = "a weight is not a number"
 
 
 @dataclass(frozen=True)
@@ -127,14 +128,20 @@ class Learner(abc.ABC):
 
         Raises SpaceDistError if the networks are no longer numbers.
         """
-        if [shard.shard for shard in shards] != list(range(len(shards))):
-            raise RuntimeError(f"shards arrived in the order {[shard.shard for shard in shards]}")
+        require_order(shards)
         before = self._gradient_steps()
         with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
             self._learn(shards, steps=steps)
             if not all(torch.isfinite(parameter).all() for parameter in self.model.policy.parameters()):
-                raise ValueError("a weight is not a number")
-        self.observe(shards)  # after learning: advantages and actions belong to the statistics that acted
+                raise ValueError(NOT_A_NUMBER)
+        return self._learnt(shards, before)
+
+    def _learnt(self, shards: Sequence[Shard], before: int) -> Update:
+        """What an update reports, of the gradient steps since there were `before`; the statistics take in the shards.
+
+        That comes after learning: advantages and actions belong to the statistics that acted.
+        """
+        self.observe(shards)
         recorded = self.model.logger.name_to_value
         metrics = {
             name.removeprefix("train/").removeprefix("rollout/"): float(value)
@@ -212,6 +219,12 @@ class Learner(abc.ABC):
         raise RuntimeError("this learner keeps no replay buffer")
 
 
+def require_order(shards: Sequence[Shard]) -> None:
+    """Raise RuntimeError unless a round's shards come in shard order."""
+    if [shard.shard for shard in shards] != list(range(len(shards))):
+        raise RuntimeError(f"shards arrived in the order {[shard.shard for shard in shards]}")
+
+
 def schedule(rate: float, kind: str) -> Any:
     """A learning rate as SB3 takes it: a number, or a function of the remaining share of the run."""
     return (lambda remaining: rate * remaining) if kind == "linear" else rate
@@ -244,7 +257,7 @@ def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], a
 def _seeded(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
     """Python's, NumPy's and torch's global generators seeded for one piece of work, and restored."""
     with global_generators(seed, purpose, *keys), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(seed_sequence(seed, purpose, *keys).generate_state(3, np.uint32)[2]))
+        torch.manual_seed(global_seeds(seed, purpose, *keys)[2])
         yield
 
 
@@ -256,7 +269,12 @@ def _divergence_explained(round: int) -> Iterator[None]:
     except (ValueError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "overflow" not in str(error):
             raise
-        raise SpaceDistError(
-            f"training diverged in update {round + 1}: the networks are no longer numbers. A smaller "
-            f"learner.learning_rate usually helps ({str(error).splitlines()[0][:120]})"
-        ) from error
+        raise divergence(round, str(error)) from error
+
+
+def divergence(round: int, reason: str) -> SpaceDistError:
+    """That an update's networks are no longer numbers, for users."""
+    return SpaceDistError(
+        f"training diverged in update {round + 1}: the networks are no longer numbers. A smaller "
+        f"learner.learning_rate usually helps ({reason.splitlines()[0][:120]})"
+    )
