@@ -20,14 +20,12 @@ import numpy as np
 
 from space_dist.cluster import Handle, InProcess
 from space_dist.config import RunConfig
-from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv
 from space_dist.envs.interface import Closable
 from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, begun, speaking
 from space_dist.learner import PopulationLearner, learn_together
-from space_dist.policy import Policy
 from space_dist.rollout import Outcomes, Rollout, Setup, Split, Trial, Walk, collect, evaluate
 from space_dist.training import Learn, Wait, Work
 
@@ -126,17 +124,12 @@ class _Promising(InProcess):
     """A member's cluster: what is large is promised, and computed with its like; the rest is done at once."""
 
     def collect(
-        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
     ) -> list[Handle]:
         """See `Cluster`."""
-        return [self._rollout(policy, selection, walk, round, steps, version, shard)
+        asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
+        return [_Promise(self._setup, self._setup.rollout(policy, selection, walk, shard=shard, **asked))
                 for shard in range(self._setup.shards)]  # fmt: skip
-
-    def _rollout(
-        self, policy: Policy, selection: Selection, walk: Walk, round: int, steps: int, version: int, shard: int
-    ) -> _Promise:
-        asked = {"round": round, "steps": steps, "shard": shard, "selection_version": version}
-        return _Promise(self._setup, self._setup.rollout(policy, selection, walk, **asked))
 
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
         """See `Cluster`."""

@@ -209,15 +209,15 @@ class Setup:
 
     def rollout(
         self, policy: Policy, selection: Selection, walk: Walk,
-        *, round: int, steps: int, shard: int, selection_version: int,
+        *, round: int, steps: int, shard: int, selection_version: int, lag: int = 0,
     ) -> Rollout:  # fmt: skip
         """One shard of one round, which begins after `steps` environment steps.
 
-        Raises RuntimeError if policy or selection are not the ones asked for.
+        lag: updates that the policy is behind. Raises RuntimeError if policy or selection are not the ones asked for.
         """
-        if selection.version != selection_version or policy.version != round:
+        if selection.version != selection_version or policy.version != round - lag:
             raise RuntimeError(
-                f"round {round} asked for selection {selection_version} and policy {round}, "
+                f"round {round} asked for selection {selection_version} and policy {round - lag}, "
                 f"and got selection {selection.version} and policy {policy.version}"
             )
         return Rollout(

@@ -192,6 +192,7 @@ class _Run:
     rounds_left: int | None = None  # in this iteration; None until the selection is known
     version: int = 0  # of the selection being trained on
     walk: Walk = field(default_factory=lambda: Walk(-1, ()))
+    came_from: Walk = field(default_factory=lambda: Walk(-1, ()))  # the walk of the round that is learned from
     rows: int = 0
     evaluated_at: int = -1  # steps
     rollouts: list[dict[str, float]] = field(default_factory=list)  # of this iteration's rounds
@@ -201,6 +202,8 @@ class _Run:
     segments: list[Segment] = field(default_factory=list)  # of the replay buffer, as of the last commit
     trained: Selection | None = None  # the selection being trained on, once known
     seen: list[Episodes] = field(default_factory=list)  # of this iteration's rounds, where anyone asks for them
+    ahead: list[Handle] = field(default_factory=list)  # shards of the next round, if they were asked for already
+    acted: Arrays | None = None  # the weights that collect these
     # Handles, and what they wait for
     state: Handle = None
     selection: Handle = None
@@ -225,12 +228,13 @@ class Wait:
 
 @dataclass(frozen=True)
 class Learn:
-    """A run needs its learner's `Update` on a round's shards, to go on. steps: of the run, with these."""
+    """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
 
     learner: Learner
     shards: list[Shard]
     round: int
     steps: int
+    acted: Arrays | None = None
 
 
 T = TypeVar("T")
@@ -276,7 +280,9 @@ class Training:
             if isinstance(request, Wait):
                 answer = self._cluster.get(request.handles)
             else:
-                answer = self.learner.update(request.shards, round=request.round, steps=request.steps)
+                answer = self.learner.update(
+                    request.shards, round=request.round, steps=request.steps, acted=request.acted
+                )
 
     def work(self) -> Work[None]:
         """What `run` does, as a generator: whoever advances it answers `Wait` and `Learn`."""
@@ -284,11 +290,11 @@ class Training:
         checkpoint = self._writer.restore()
         policy = self._restore(checkpoint) if checkpoint else (yield from self._begin())
         while not self._is_over():
-            shards: list[Shard] = yield from self._settle(
-                cluster.collect(policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version)
-            )
-            scales = self.learner.statistics  # the ones that the round was collected under
-            update = yield Learn(self.learner, shards, run.round, run.steps + sum(shard.steps for shard in shards))
+            shards: list[Shard] = yield from self._settle(run.ahead or self._collect(policy, lag=0))
+            run.ahead, acted, scales = [], run.acted, self.learner.statistics  # of the weights that acted
+            self._arrived(shards, lag=0 if acted is None else 1)
+            run.acted = self._look_ahead(policy)
+            update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted)
             self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
@@ -434,34 +440,62 @@ class Training:
         run.pending.append(_Pending(handles, settle))
         run.evaluated_at = run.steps
 
-    def _account(self, shards: list[Shard], update: Update) -> None:
+    def _collect(self, policy: Handle, *, lag: int) -> list[Handle]:
+        """Ask for the next round."""
+        run = self._run
+        return self._cluster.collect(
+            policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version, lag=lag
+        )
+
+    def _arrived(self, shards: list[Shard], *, lag: int) -> None:
+        """Count a round's shards, and note where the next one goes on."""
         run = self._run
         for shard in shards:
-            if (shard.policy_version, shard.selection_version, shard.round) != (run.round, run.version, run.round):
+            if (shard.policy_version, shard.selection_version, shard.round) != (
+                run.round - lag,
+                run.version,
+                run.round,
+            ):
                 raise RuntimeError(f"shard {shard.shard} of round {run.round} answers another question")
-        order, n_shards = shards[0].order_version, len(shards)
         selection = run.trained
         if selection is None or run.rounds_left is None:
             raise RuntimeError("a round ended before its selection was known")
-        if self._curriculum.wants.episodes:
-            places = [run.walk.places(selection, shard.shard, n_shards, len(shard.episodes)) for shard in shards]
-            run.seen.append(
-                _episodes(self._setup.train, selection, np.concatenate(places), shards, update.advantages)
-            )  # fmt: skip
+        run.came_from, n_shards = run.walk, len(shards)
         run.walk = Walk(
-            order,
+            shards[0].order_version,
             tuple(
                 (run.walk.position(selection, shard.shard, n_shards) + len(shard.episodes)) % len(selection.ids)
                 for shard in shards
             ),
         )
-        run.rollouts.append(_rollout_sums(shards))
-        run.updates.append(update.metrics)
-        run.gradient_steps += update.gradient_steps
         run.round += 1
         run.rounds_left -= 1
         run.steps += sum(shard.steps for shard in shards)
         run.episodes += sum(len(shard.episodes) for shard in shards)
+
+    def _look_ahead(self, policy: Handle) -> Arrays | None:
+        """With `rollout.overlap`, ask for the next round before the update on this one; returns the weights that act.
+
+        Not at the end of an iteration: the next selection is not known yet.
+        """
+        if not self._config.rollout.overlap or self._run.rounds_left == 0 or self._is_over():
+            return None
+        self._run.ahead = self._collect(policy, lag=1)
+        return self.learner.scored()
+
+    def _account(self, shards: list[Shard], update: Update) -> None:
+        """Note what a round's episodes and its update showed."""
+        run, selection = self._run, self._run.trained
+        if selection is not None and self._curriculum.wants.episodes:
+            places = [
+                run.came_from.places(selection, shard.shard, len(shards), len(shard.episodes)) for shard in shards
+            ]
+            run.seen.append(
+                _episodes(self._setup.train, selection, np.concatenate(places), shards, update.advantages)
+            )  # fmt: skip
+        run.rollouts.append(_rollout_sums(shards, lag=run.round - 1 - shards[0].policy_version))
+        run.updates.append(update.metrics)
+        run.gradient_steps += update.gradient_steps
 
     def _finish(self) -> Work[None]:
         run = self._run
@@ -508,6 +542,7 @@ class Training:
             "episodes": int(totals["episodes"]),
             "episodes_cut": int(totals["cut"]),
             "gradient_steps": run.gradient_steps,
+            **({"lagged_steps": int(totals["lagged"])} if self._config.rollout.overlap else {}),
             "rollout": {
                 name: totals[name] / finished if finished and math.isfinite(totals[name]) else None
                 for name in ("return", "discounted_return", "length", "success")
@@ -569,6 +604,7 @@ class Training:
         arrays["values"] = values
         arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
         arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
+        arrays |= {f"acted/{name}": array for name, array in (run.acted or {}).items()}
         if run.seen:
             arrays |= {f"seen/{name}": array for name, array in vars(_joined_episodes(run.seen)).items()}
         if self.ensemble is not None:
@@ -626,6 +662,9 @@ class Training:
         if self.ensemble is not None:
             self.ensemble.load(_under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
+        if acted := _under("acted/", arrays):
+            run.acted = acted
+            run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
 
     def _show(self) -> None:
@@ -748,9 +787,13 @@ def _joined_episodes(parts: Sequence[Episodes]) -> Episodes:
     return Episodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def _rollout_sums(shards: list[Shard]) -> dict[str, float]:
-    """Sums over a round's finished episodes (cut ones have no return), and how many there were."""
-    sums = dict.fromkeys(("episodes", "cut", "finished", "return", "discounted_return", "length", "success"), 0.0)
+def _rollout_sums(shards: list[Shard], *, lag: int) -> dict[str, float]:
+    """Sums over a round's finished episodes (cut ones have no return), and how many there were.
+
+    lag: updates that the acting weights were behind.
+    """
+    sums = {"lagged": float(lag * sum(shard.steps for shard in shards))}
+    sums |= dict.fromkeys(("episodes", "cut", "finished", "return", "discounted_return", "length", "success"), 0.0)
     for shard in shards:
         episodes = shard.episodes
         finished = episodes.ends != CUT

@@ -60,8 +60,9 @@ def equivalence(
     curriculum: Annotated[str, typer.Option(help="Which config: pointmass_<curriculum>.yaml.")] = "round_robin",
     steps: Annotated[int, typer.Option(min=4096, help="Environment steps of each run.")] = 102_400,
     root: Annotated[
-        Optional[Path], typer.Option(help="Keep the runs here; what is done there is not run again.")
-    ] = None,  # noqa: UP045
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Keep the runs here; what is done stays."),
+    ] = None,
     max_parallel: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 2,
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
 ) -> None:
@@ -105,7 +106,7 @@ def equivalence(
 
 
 def needed(spread: float, margin: float) -> int:
-    """Seeds per arm for POWER if there is no difference (Phillips 1990), where all arms have this standard deviation."""
+    """Seeds per arm for POWER if there is no difference (Phillips 1990) and all arms have this standard deviation."""
     for count in range(2, 10_000):
         freedom = 2 * count - 2
         distance = margin / (spread * math.sqrt(2 / count))

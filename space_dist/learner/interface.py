@@ -59,6 +59,7 @@ class Learner(abc.ABC):
     ) -> None:
         self._config, self._seed, self._total_steps = config, seed, total_steps
         self._episode_advantages: NDArray[np.float64] | None = None  # of the last update
+        self._acted: Mapping[str, NDArray[Any]] | None = None  # for the present one
         refuse_spaces(config, observation_space, action_space)
         self._normaliser = (
             Normaliser(observation_space, config.gamma, config.normalize_observations, config.normalize_rewards)
@@ -107,10 +108,19 @@ class Learner(abc.ABC):
 
     def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Policy:
         """The policy of earlier weights, under the scales in force now."""
-        now = self.scored()
-        self.model.policy.load_state_dict({name: torch.as_tensor(array.copy()) for name, array in scored.items()})
-        try:
+        with self._weights(scored):
             return self.policy(version)
+
+    @contextmanager
+    def _weights(self, others: Mapping[str, NDArray[Any]] | None) -> Iterator[None]:
+        """Have other weights meanwhile: what `scored` gave earlier. None: these."""
+        if others is None:
+            yield
+            return
+        now = self.scored()
+        self.model.policy.load_state_dict({name: torch.as_tensor(array.copy()) for name, array in others.items()})
+        try:
+            yield
         finally:
             self.model.policy.load_state_dict({name: torch.as_tensor(array) for name, array in now.items()})
 
@@ -123,12 +133,16 @@ class Learner(abc.ABC):
         if self._normaliser is not None:
             self._normaliser.update(shards)
 
-    def update(self, shards: Sequence[Shard], *, round: int, steps: int) -> Update:
+    def update(
+        self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
         """One update on one round's shards, in shard order. `steps`: environment steps including this round's.
 
+        acted: the weights that the shards were collected with, if those are not the present ones (`scored` gave them).
         Raises SpaceDistError if the networks are no longer numbers.
         """
         require_order(shards)
+        self._acted = acted
         before = self._gradient_steps()
         with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
             self._learn(shards, steps=steps)

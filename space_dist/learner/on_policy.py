@@ -98,7 +98,8 @@ class OnPolicyLearner(Learner):
         )
 
     def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
-        advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
+        with self._weights(self._acted):
+            advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
         self._episode_advantages = mean_sizes(shards, advantages) * self.statistics.reward_std
         self.model.num_timesteps = steps
         self.model._update_current_progress_remaining(steps, self._total_steps)

@@ -8,7 +8,7 @@ are copied into a stack (`stacked`) and back, which takes a few of the milliseco
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,8 +76,12 @@ class PopulationLearner(OnPolicyLearner):
         self.shape = _shape(config, observation_space, action_space)
         self.key = (stack_key(config, observation_space, action_space), dtype, device)
 
-    def update(self, shards: Sequence[Shard], *, round: int, steps: int) -> Update:
-        """As `Learner.update`."""
+    def update(
+        self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
+        """As `Learner.update`; the shards must be those of the present weights."""
+        if acted is not None:
+            raise RuntimeError("a population learns from rounds of its present weights only")
         (result,) = learn_together([self], [shards], round=[round], steps=[steps])
         if isinstance(result, SpaceDistError):
             raise result
