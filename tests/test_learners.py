@@ -715,3 +715,12 @@ def test_overlap_is_refused_where_it_cannot_be(kind: str, changes: Any, words: s
     rollout = {"shards": 4, "slots": 2, "overlap": True}
     with pytest.raises(ConfigError, match=words):
         config_for(tmp_path, learner_section(kind, **changes), rollout=rollout, engine=engine)
+
+
+@pytest.mark.ray
+@pytest.mark.usefixtures("one_ray")
+def test_rounds_collected_ahead_by_actors_are_the_same(tmp_path: Path) -> None:
+    rollout = {"shards": 4, "slots": 2, "overlap": True, "passes": 4.0}
+    config = config_for(tmp_path, learner_section("ppo"), rollout=rollout, curriculum={"kind": "round_robin"})
+    there = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 2})})
+    assert run(there, tmp_path / "actors") == run(config, tmp_path / "here")
