@@ -23,8 +23,10 @@ from space_dist.config import to_yaml
 from space_dist.ledger import METRICS, Ledger
 from space_dist.manifest import Grid
 from space_dist.slurm import Export, Profile
-from space_dist.slurm.export import AGGREGATE, JOBS, render
+from space_dist.slurm import export as write_scripts
+from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
 from tests.slurm.gated_env import GATE
+from tests.slurm.profiles import FIELDS, RESERVATION, exports
 
 ROOT = Path(__file__).resolve().parent.parent
 HERE = ROOT / "tests/slurm"
@@ -289,3 +291,34 @@ def test_sbatch_reads_hostile_values_as_text(slurm: Slurm, reference: Grid, tmp_
         slurm.ask("scancel", job)
         assert f"Comment={value}" in [line.strip() for line in shown.splitlines()], shown
     assert list(tmp_path.glob("**/canary")) == []
+
+
+def test_sbatch_accepts_every_drawn_profile(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
+    def objection(folder: Path, script: str) -> str:
+        done = subprocess.run(
+            ["sbatch", "--test-only", script], cwd=folder, env=slurm.environment, text=True, capture_output=True,
+            timeout=60,
+        )  # fmt: skip
+        assert (done.returncode == 0) is ("to start at" in done.stderr), done.stderr
+        return "" if done.returncode == 0 else done.stderr
+
+    manifest, drawn, files = reference.manifest(), set(), 0
+    slurm.ask("scontrol", "create", "reservation", f"ReservationName={RESERVATION}", "StartTime=now+1hour",
+              "Duration=30-0", "Users=root", "Nodes=n[1-2]")  # fmt: skip
+    try:
+        for number, made in enumerate(exports(manifest, 24)):
+            write_scripts(made, reference.instance_files(manifest), tmp_path / str(number))
+            for script in (TRAIN, AGGREGATE):
+                said = objection(tmp_path / str(number), script)
+                assert not said, (made.profile.model_dump(exclude_unset=True), script, said)
+                files += 1
+            drawn |= made.profile.model_fields_set
+    finally:
+        slurm.ask("scontrol", "delete", f"ReservationName={RESERVATION}")
+    assert files == 48
+    assert drawn >= FIELDS
+    assert list(tmp_path.glob("**/canary")) == []
+    for wrong, what in (({"partition": "nowhere"}, "partition"), ({"nodelist": "n7"}, "node"), ({"mem": "99G"}, "")):
+        made = Export(manifest, Profile.model_validate(wrong), "array")
+        write_scripts(made, reference.instance_files(manifest), tmp_path / "wrong")
+        assert what in objection(tmp_path / "wrong", TRAIN) != ""

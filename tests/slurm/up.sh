@@ -81,8 +81,10 @@ AccountingStorageType=accounting_storage/none
 JobAcctGatherType=jobacct_gather/none
 JobCompType=jobcomp/none
 GresTypes=gpu
-NodeName=n[1-$NODES] NodeAddr=$NET.[11-$((10 + NODES))] Port=$((PORT + 1)) CPUs=$CPUS RealMemory=$MEM Gres=gpu:2 State=UNKNOWN
+NodeName=n[1-$NODES] NodeAddr=$NET.[11-$((10 + NODES))] Port=$((PORT + 1)) CPUs=$CPUS RealMemory=$MEM Gres=gpu:2 Feature=avx,sse State=UNKNOWN
+Licenses=matlab:2
 PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+PartitionName=late Nodes=ALL MaxTime=INFINITE State=UP
 CONF
 echo "NodeName=n[1-$NODES] Name=gpu File=/dev/tty[1-2]" >"$D/gres.conf" # any device files do
 # --force: the folder above may be closed to others
