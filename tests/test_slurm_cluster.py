@@ -27,6 +27,8 @@ from space_dist.slurm import export as write_scripts
 from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
 from tests.slurm.gated_env import GATE
 from tests.slurm.profiles import FIELDS, RESERVATION, exports
+from tests.test_grid_tracking import everything
+from tests.test_tracking import histories
 
 ROOT = Path(__file__).resolve().parent.parent
 HERE = ROOT / "tests/slurm"
@@ -193,13 +195,18 @@ def hosts(folder: Path) -> set[str]:
     return {row["where"]["host"] for row in rows if row["event"] == "begin"}
 
 
-def test_an_array_survives_preemption_and_its_time_limit(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
-    gate = tmp_path / "gate"
+def test_an_array_survives_preemption_and_its_time_limit(
+    slurm: Slurm, reference: Grid, empty_store: Path, tmp_path: Path
+) -> None:
+    gate, database = tmp_path / "gate", tmp_path / "mlflow.db"
     gate.touch()  # runs are slow until all that is to happen has happened
+    shutil.copy(empty_store, database)
+    grid_file = write_grid(
+        tmp_path / "written", "eight", seeds=(0, 1), grid={"curriculum": list(KINDS)},
+        tracking={"uri": f"sqlite:///{database}"},
+    )  # fmt: skip
     # Exported, and then copied elsewhere, as a user would: with nothing but what is in the folder.
-    made = export(
-        reference.folder, tmp_path / "out", gate, "--cells-per-task", 2, "--throttle", 3, "--check", slurm=slurm
-    )
+    made = export(grid_file, tmp_path / "out", gate, "--cells-per-task", 2, "--throttle", 3, "--check", slurm=slurm)
     folder = tmp_path / "else where" / "grid"
     shutil.copytree(made, folder)
     shutil.rmtree(made)
@@ -230,8 +237,20 @@ def test_an_array_survives_preemption_and_its_time_limit(slurm: Slurm, reference
     assert [slurm.job(name)["JobState"] for name in names] == ["COMPLETED"] * 4
     said = (folder / f"logs/eight-aggregate-{aggregate}.out").read_text()
     assert "eight: 8 of 8 runs done" in said
+    assert "8 runs are up to date in MLflow (8 new" in said
     assert any((folder / "report").iterdir())
     assert_same_results(folder, reference)
+    _, children = everything(f"sqlite:///{database}", "eight")
+    assert {child.data.tags["space_dist.folder"] for child in children.values()} == {
+        str(grid.ledger(run).folder) for run in runs
+    }
+    for child in children.values():
+        assert child.info.status == "FINISHED"
+        ledger = Ledger(Path(child.data.tags["space_dist.folder"]))
+        told = [(row["steps"], row["test"]["return"]) for row in ledger.rows() if row["kind"] == "evaluation"]
+        stored = histories(f"sqlite:///{database}", child)["test/return"]
+        assert [(step, value) for _, step, value in stored] == told
+    assert "(0 new, 0 rows pushed)" in space_dist("sync", folder)
     for node in (1, 2):
         await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
 
