@@ -25,6 +25,7 @@ from space_dist.manifest import Grid
 from space_dist.slurm import Export, Profile
 from space_dist.slurm import export as write_scripts
 from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
+from space_dist.standing import Attempts
 from tests.slurm.gated_env import GATE
 from tests.slurm.profiles import FIELDS, RESERVATION, exports
 from tests.test_grid_tracking import everything
@@ -222,19 +223,21 @@ def test_an_array_survives_preemption_and_its_time_limit(
     for element in (0, 1, 2):
         await_run(element)
     assert slurm.job(names[3])["JobState"] == "PENDING"  # the throttle
-    hours, minutes, seconds = map(int, slurm.job(names[2])["RunTime"].split(":"))
-    limit = (3600 * hours + 60 * minutes + seconds + 110) // 60  # so that its end is near all of a sudden
-    slurm.ask("scontrol", "update", f"JobId={names[2]}", f"TimeLimit={limit}")
+    slurm.ask("scontrol", "update", f"JobId={names[2]}", "EndTime=now+110")  # which SLURM announces
     slurm.ask("scontrol", "requeue", names[0])
     slurm.ask("scontrol", "requeue", names[1])
     await_run(3)
     slurm.ask("scancel", "--batch", "--signal=USR1", names[3])
-    for name in names:
-        await_(lambda name=name: slurm.job(name).get("Restarts") == "1", f"{name} to be requeued", folder)
-    slurm.ask("scontrol", "update", f"JobId={names[2]}", "TimeLimit=UNLIMITED")
+    await_(lambda: any(Attempts(grid.ledger(run)).history().begun == 2 for run in runs[:2]), "0 to be back", folder)
+    slurm.ask("scontrol", "update", f"JobId={names[0]}", "EndTime=now")  # without notice
+    for name, restarts in zip(names, "2111", strict=True):
+        await_(lambda: slurm.job(name).get("Restarts") == restarts, f"{name} to be requeued", folder)  # noqa: B023
     gate.unlink()
     assert await_end(slurm, aggregate, folder) == "COMPLETED"
     assert [slurm.job(name)["JobState"] for name in names] == ["COMPLETED"] * 4
+    told = [(folder / f"logs/eight-{name}.out").read_text() for name in names]
+    assert ["ended at its time limit, without notice" in text for text in told] == [True, False, False, False]
+    assert "interrupted; requeued for the 2. time" in told[0]
     said = (folder / f"logs/eight-aggregate-{aggregate}.out").read_text()
     assert "eight: 8 of 8 runs done" in said
     assert "8 runs are up to date in MLflow (8 new" in said
@@ -247,9 +250,9 @@ def test_an_array_survives_preemption_and_its_time_limit(
     for child in children.values():
         assert child.info.status == "FINISHED"
         ledger = Ledger(Path(child.data.tags["space_dist.folder"]))
-        told = [(row["steps"], row["test"]["return"]) for row in ledger.rows() if row["kind"] == "evaluation"]
+        evaluations = [(row["steps"], row["test"]["return"]) for row in ledger.rows() if row["kind"] == "evaluation"]
         stored = histories(f"sqlite:///{database}", child)["test/return"]
-        assert [(step, value) for _, step, value in stored] == told
+        assert [(step, value) for step, _, value in stored] == evaluations
     assert "(0 new, 0 rows pushed)" in space_dist("sync", folder)
     for node in (1, 2):
         await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)

@@ -108,12 +108,15 @@ class Result:
     seconds: float = 0.0
 
 
-def plan(kinds: Sequence[str], count: int, steps: int, seed: int) -> list[Fault]:
-    """`count` faults over a grid of `steps` environment steps, every kind as often as any other, give or take one."""
+def plan(kinds: Sequence[str], count: int, steps: int, seed: int, last: float = _LAST) -> list[Fault]:
+    """`count` faults over a grid of `steps` environment steps, every kind as often as any other, give or take one.
+
+    last: by which share of the steps all have fallen.
+    """
     draws = np.random.default_rng(np.random.SeedSequence(seed))
     chosen = [kinds[number % len(kinds)] for number in range(count)]
     draws.shuffle(chosen)
-    moments = np.sort(draws.uniform(_FIRST * steps, _LAST * steps, count))
+    moments = np.sort(draws.uniform(_FIRST * steps, last * steps, count))
     return [
         Fault(kind, float(moment), float(draws.uniform(0.0, _MOST_DELAY)), float(draws.uniform(0.0, _MOST_PAUSE)),
               float(draws.random()))
@@ -142,11 +145,13 @@ def chaos(
 
 def rehearse(
     *, runs: int, steps: int, seed: int, kinds: Sequence[str], count: int, say: Callable[[str], None],
-    base: Path = BASE, settings: Mapping[str, Any] = SETTINGS, after_faults: Callable[[], None] = lambda: None,
+    base: Path = BASE, settings: Mapping[str, Any] = SETTINGS, last: float = _LAST,
+    after_faults: Callable[[], None] = lambda: None,
 ) -> Result:  # fmt: skip
     """Work on one grid twice, once left alone and once not; returns what was found.
 
-    base, settings: the config of its runs, and what is changed of it. after_faults: called when the last has fallen.
+    base, settings: the config of its runs, and what is changed of it. last: see `plan`. after_faults: called when all
+    faults have fallen.
     """
     mark = secrets.token_hex(8)
     folder = Path(tempfile.mkdtemp(prefix="sd", dir="/tmp"))
@@ -167,7 +172,7 @@ def rehearse(
             rehearsal = _Rehearsal(folder, write("chaos", server.address), head, server, mark, result, say)
             start = time.monotonic()
             try:
-                rehearsal.run(plan(kinds, count, runs * steps, seed), after_faults)
+                rehearsal.run(plan(kinds, count, runs * steps, seed, last), after_faults)
                 result.seconds = time.monotonic() - start
                 rehearsal.check(_finished(alone, folder))
             finally:

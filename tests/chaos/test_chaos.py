@@ -44,7 +44,7 @@ def test_a_grid_under_faults_is_the_grid_left_alone(tmp_path: Path, monkeypatch:
     gate.touch()
     monkeypatch.setenv(GATE, str(gate))
     result = rehearse(
-        runs=3, steps=7680, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append, base=base,
+        runs=3, steps=7680, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append, base=base, last=0.4,
         settings={**instances, "learner.n_steps": 256, "evaluation.every_steps": 2560}, after_faults=gate.unlink,
     )  # fmt: skip
     assert not result.faults, "\n".join([*result.faults, *said])

@@ -95,7 +95,7 @@ unshare --mount bash -c 'mount --bind "$0" /etc/hosts && slurmctld' "$D/hosts" #
 for i in $(seq "$NODES"); do start_node "$i"; done
 SECONDS=0
 while [ $SECONDS -lt 60 ]; do
-  [ "$(timeout 5 sinfo -h -N -r -t idle -o %N 2>/dev/null | wc -l)" = "$NODES" ] && exit 0
+  [ "$(timeout 5 sinfo -h -p debug -N -r -t idle -o %N 2>/dev/null | wc -l)" = "$NODES" ] && exit 0
   sleep 0.2
 done
 echo "up.sh: the nodes are not idle after 60 s; see $D/log" >&2
