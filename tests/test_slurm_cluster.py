@@ -324,23 +324,20 @@ def test_sbatch_accepts_every_drawn_profile(slurm: Slurm, reference: Grid, tmp_p
         assert (done.returncode == 0) is ("to start at" in done.stderr), done.stderr
         return "" if done.returncode == 0 else done.stderr
 
-    manifest, drawn, files = reference.manifest(), set(), 0
-    slurm.ask("scontrol", "create", "reservation", f"ReservationName={RESERVATION}", "StartTime=now+1hour",
-              "Duration=30-0", "Users=root", "Nodes=n[1-2]")  # fmt: skip
-    try:
-        for number, made in enumerate(exports(manifest, 24)):
-            write_scripts(made, reference.instance_files(manifest), tmp_path / str(number))
+    manifest, made = reference.manifest(), exports(reference.manifest(), 40)
+    assert {name for one in made for name in one.profile.model_fields_set} == FIELDS | {"apptainer_options"}
+    with contextlib.ExitStack() as stack:
+        for number, one in enumerate(sorted(made, key=lambda one: one.profile.reservation or "")):
+            if one.profile.reservation is not None and RESERVATION not in slurm.ask("scontrol", "show", "reservation"):
+                slurm.ask("scontrol", "create", "reservation", f"ReservationName={RESERVATION}", "StartTime=now",
+                          "Duration=UNLIMITED", "Users=root", "Nodes=n[1-2]", "Flags=IGNORE_JOBS")  # fmt: skip
+                stack.callback(slurm.ask, "scontrol", "delete", f"ReservationName={RESERVATION}")
+            write_scripts(one, reference.instance_files(manifest), tmp_path / str(number))
             for script in (TRAIN, AGGREGATE):
                 said = objection(tmp_path / str(number), script)
-                assert not said, (made.profile.model_dump(exclude_unset=True), script, said)
-                files += 1
-            drawn |= made.profile.model_fields_set
-    finally:
-        slurm.ask("scontrol", "delete", f"ReservationName={RESERVATION}")
-    assert files == 48
-    assert drawn >= FIELDS
+                assert not said, (one.profile.model_dump(exclude_unset=True), script, said)
     assert list(tmp_path.glob("**/canary")) == []
     for wrong, what in (({"partition": "nowhere"}, "partition"), ({"nodelist": "n7"}, "node"), ({"mem": "99G"}, "")):
-        made = Export(manifest, Profile.model_validate(wrong), "array")
-        write_scripts(made, reference.instance_files(manifest), tmp_path / "wrong")
+        refused = Export(manifest, Profile.model_validate(wrong), "array")
+        write_scripts(refused, reference.instance_files(manifest), tmp_path / "wrong")
         assert what in objection(tmp_path / "wrong", TRAIN) != ""

@@ -25,7 +25,7 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "mem": (500, "1500", "1G", "700M"),
     "mem_per_cpu": (300, "1G"),
     "gres": ("gpu:1", "gpu"),
-    "gpus": (1, "2"),
+    "gpus": (2, "2"),  # no fewer than there are nodes
     "exclusive": (True, "user"),
     "throttle": (1, 3),
     "output": ("logs/%x-%A_%a.out", "a folder/%x %A_%a.txt", "%A_%a.out"),
@@ -38,8 +38,9 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "comment": ("plain", "it's a \"comment\" # not", "$(touch canary) `touch canary` \\"),
     "extra": (
         ("--nice=100",), ("--nice",), ("--licenses=matlab:1", "--wckey=thesis"), ("--begin=now+1hour",),
-        ("--mincpus=1", "--tmp=1"), ("--distribution=cyclic", "--threads-per-core=1"), ("--hold", "--export=NONE"),
-        ("--deadline=now+30days", "--priority=17"), ("--no-kill", "--spread-job"), ("--contiguous",),
+        ("--mincpus=1", "--use-min-nodes"), ("--distribution=cyclic", "--threads-per-core=1"),
+        ("--hold", "--export=NONE"), ("--deadline=now+30days", "--priority=17"), ("--no-kill", "--spread-job"),
+        ("--contiguous",),
     ),
     "aggregate": ({"partition": "late", "time": "00:30:00"}, {"mem": "2G", "qos": "normal"}, {"time": 15}),
     "env": ({"A": "b c", "B_1": "$HOME"}, {"PYTHONPATH": "/a folder:/it's"}),
