@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from space_dist.cli.terminal import STOP, Overrides, console, say, warn, write
+from space_dist.cli.terminal import STOP, Json, Overrides, console, say, warn, write
 from space_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def evaluate(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Also write every instance's results to this CSV."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
