@@ -5,7 +5,7 @@ from __future__ import annotations
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
 import typer
-from benchmarks import chaos, checkpoint, curricula, curriculum, envs, grid
+from benchmarks import chaos, checkpoint, curricula, curriculum, envs, grid, throughput
 from rich.console import Console
 
 from space_dist.errors import SpaceDistError
@@ -18,6 +18,7 @@ for _benchmark in (
     curriculum.curriculum,
     envs.envs,
     grid.grid,
+    throughput.throughput,
 ):
     app.command()(_benchmark)
 

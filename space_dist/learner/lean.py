@@ -185,7 +185,7 @@ class _Vector:
     """All numbers of an actor-critic, in the order of `_parameters`, and views of them.
 
     hidden: of each hidden layer, weights (2, n_out, n_in) and biases (2, 1, n_out): the actor's and the critic's.
-    actor, critic: weights (n_outputs, n_in) and biases (n_outputs,) of their last layers; the critic's has one output.
+    actor: weights (n_outputs, n_in) and biases (n_outputs,) of its last layer; critic: (n_in,) and (1,).
     log_std: (n_outputs,) of Gaussian actions; (0,) of categorical ones.
     """
 
@@ -209,7 +209,8 @@ class _Vector:
             (cut(2, layer.out_features, layer.in_features), cut(2, 1, layer.out_features))
             for layer in _linear(policy.mlp_extractor.policy_net)
         )
-        actor, critic = ((cut(*head.weight.shape), cut(*head.bias.shape)) for head in _heads(policy))
+        actor = (cut(*policy.action_net.weight.shape), cut(*policy.action_net.bias.shape))
+        critic = (cut(policy.value_net.in_features), cut(1))
         return cls(flat, hidden, actor, critic, cut(len(flat) - start))
 
 
@@ -218,16 +219,12 @@ def _parameters(policy: Any) -> list[nn.Parameter]:
     extractor = policy.mlp_extractor
     pairs = zip(_linear(extractor.policy_net), _linear(extractor.value_net), strict=True)
     hidden = [part for pair in pairs for name in ("weight", "bias") for part in (getattr(each, name) for each in pair)]
-    heads = [part for head in _heads(policy) for part in (head.weight, head.bias)]
+    heads = [part for head in (policy.action_net, policy.value_net) for part in (head.weight, head.bias)]
     return [*hidden, *heads, *([policy.log_std] if hasattr(policy, "log_std") else [])]
 
 
 def _linear(network: nn.Module) -> list[nn.Linear]:
     return [layer for layer in network.children() if isinstance(layer, nn.Linear)]
-
-
-def _heads(policy: Any) -> tuple[nn.Linear, nn.Linear]:
-    return policy.action_net, policy.value_net
 
 
 def _parts(vector: Tensor, parameters: Sequence[nn.Parameter]) -> list[Tensor]:
@@ -252,16 +249,18 @@ class _Network:
         self.head = (_Gaussian if hasattr(policy, "log_std") else _Categorical)(self.weights, self.gradient)
         self._activate, self._through = _ACTIVATIONS[policy.activation_fn]
         self._results: list[Tensor] = []
+        self._transposed = [weights.transpose(1, 2) for weights, _ in self.weights.hidden]
+        self._actor_transposed = self.weights.actor[0].t()
 
     def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """`(m, n_in) -> (m, n_outputs), (m,)`: the actor's outputs and the critic's values."""
         result = observations.expand(2, *observations.shape)
         self._results = [result]
-        for weights, biases in self.weights.hidden:
-            result = self._activate(torch.baddbmm(biases, result, weights.transpose(1, 2)))
+        for (_, biases), weights in zip(self.weights.hidden, self._transposed, strict=True):
+            result = self._activate(torch.baddbmm(biases, result, weights))
             self._results.append(result)
-        (actor, actor_bias), (critic, critic_bias) = self.weights.actor, self.weights.critic
-        return torch.addmm(actor_bias, result[0], actor.t()), torch.mv(result[1], critic[0]) + critic_bias
+        (_, actor_bias), (critic, critic_bias) = self.weights.actor, self.weights.critic
+        return torch.addmm(actor_bias, result[0], self._actor_transposed), torch.mv(result[1], critic) + critic_bias
 
     def backward(self, by_outputs: Tensor, by_values: Tensor) -> None:
         """Fill the gradient, but for the head's part, from the loss's derivatives by what `forward` returned."""
@@ -270,11 +269,11 @@ class _Network:
         result = self._results[-1]
         torch.mm(by_outputs.t(), result[0], out=by_actor)
         torch.sum(by_outputs, 0, out=by_actor_bias)
-        torch.mv(result[1].t(), by_values, out=by_critic[0])
+        torch.mv(result[1].t(), by_values, out=by_critic)
         torch.sum(by_values, 0, keepdim=True, out=by_critic_bias)
         by_results = torch.empty_like(result)
         torch.mm(by_outputs, actor, out=by_results[0])
-        torch.outer(by_values, critic[0], out=by_results[1])
+        torch.outer(by_values, critic, out=by_results[1])
         for layer in reversed(range(len(self.weights.hidden))):
             by_sums = self._through(by_results, self._results[layer + 1])
             by_weights, by_biases = self.gradient.hidden[layer]
