@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -24,14 +25,14 @@ from space_dist.ledger import Ledger
 
 ROOT = Path(__file__).resolve().parents[2]
 CORES = 2
+PATIENCE = 60.0  # seconds for a setting that is tried, its start included: one with too many threads may take hours
 PARTS = (*TASKS, "population", "table1")
 DUMMY, SUBPROCESSES, BATCHED = (4, 8, 16, 32), (2, 4, 8), (16, 64)  # environments that are tried for rivals
 RUNNERS = ((0, 1), (0, 8), (0, 32), (2, 1), (2, 8))  # RLlib's env runners, and environments of each
 MEMBERS: dict[str, list[Any]] = {"learner.learning_rate": [1e-4, 2e-4, 3e-4, 5e-4]}  # of a population, times 8 seeds
-TABLE1: dict[str, list[Any]] = {
-    "curriculum.kappa": [1, 4, 16, 64],
-    "curriculum.eta": [0.025, 0.05, 0.1, 0.2],
-}  # docs/grids.md
+TABLE1: dict[str, list[Any]] = {  # docs/grids.md
+    "curriculum.kappa": [1, 4, 16, 64], "curriculum.eta": [0.025, 0.05, 0.1, 0.2],
+}  # fmt: skip
 TABLE1_STEPS = 4 * 4 * 10 * 1e6
 # What is wanted at least, on two cores.
 WANTED = {
@@ -153,8 +154,8 @@ def _rows(task: str, seconds: float) -> dict[str, Row]:
 
 
 def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
-    """The fastest in one short measurement each."""
-    rates = {contender: _rate(task, contender, seconds / 2.0) for contender in contenders}
+    """The fastest in one short measurement each; one that does not get it done in a minute is none."""
+    rates = {contender: _rate(task, contender, seconds / 2.0, patience=PATIENCE) for contender in contenders}
     for contender, rate in rates.items():
         console.print(
             f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s", style="dim", markup=False
@@ -185,7 +186,7 @@ def _population_rows(seconds: float, member_steps: int) -> dict[str, Row]:
         best = _best("pointmass", contenders, seconds)
         rows[name] = Row(
             f"{best.title}, {CORES} processes at a time", best.setting,
-            lambda best=best: _rate("pointmass", best, seconds, CORES),  # type: ignore[misc]
+            lambda best=best: _rate("pointmass", best, seconds, processes=CORES),  # type: ignore[misc]
             {cause: wait / CORES for cause, wait in _waits(best, costs).items()},
         )  # fmt: skip
     rows["population"] = Row(
@@ -198,11 +199,21 @@ def _population_rows(seconds: float, member_steps: int) -> dict[str, Row]:
 # ---- how it is measured ----
 
 
-def _rate(task: str, contender: Contender, seconds: float, processes: int = 1) -> float:
-    """Steps per second of so many processes at once, together."""
+def _rate(
+    task: str, contender: Contender, seconds: float, *, processes: int = 1, patience: float | None = None
+) -> float:
+    """Steps per second of so many processes at once, together; 0 if they take longer than `patience` seconds."""
     wanted = specification(task, contender, seconds)
     running = [_start(wanted) for _ in range(processes)]
-    return sum(_finish(process, wanted)["rate"] for process in running)
+    try:
+        return sum(_finish(process, wanted, patience)["rate"] for process in running)
+    except subprocess.TimeoutExpired:
+        return 0.0
+    finally:
+        for process in running:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
 
 
 def _process(wanted: str) -> dict[str, float]:
@@ -215,12 +226,12 @@ def _start(wanted: str) -> subprocess.Popen[str]:
     environment |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
     return subprocess.Popen(
         [sys.executable, "-W", "ignore", "-m", "benchmarks.contenders", wanted],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True,
     )  # fmt: skip
 
 
-def _finish(process: subprocess.Popen[str], wanted: str) -> dict[str, float]:
-    output, errors = process.communicate()
+def _finish(process: subprocess.Popen[str], wanted: str, patience: float | None = None) -> dict[str, float]:
+    output, errors = process.communicate(timeout=patience)
     if process.returncode:
         raise SpaceDistError(f"a contender failed: {wanted}: {errors[-2000:]}")
     found: dict[str, float] = json.loads(output.splitlines()[-1])
