@@ -66,9 +66,9 @@ class Cluster(Protocol):
         """Make a value available to every worker."""
 
     def collect(
-        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
     ) -> list[Handle]:
-        """One `Shard` per shard, of a round that begins after `steps` environment steps."""
+        """One `Shard` per shard, of a round that begins after `steps` environment steps; see `Setup.rollout`."""
 
     def start_values(self, policy: Handle) -> list[Handle]:
         """One array per chunk of the training instances. `policy` may be an ensemble."""
@@ -159,10 +159,10 @@ class InProcess:
         return value
 
     def collect(
-        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
     ) -> list[Handle]:
         """See `Cluster`."""
-        asked = {"round": round, "steps": steps, "selection_version": version}
+        asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
         return [
             self._worker.collect(policy, selection, walk, shard=shard, **asked) for shard in range(self._setup.shards)
         ]

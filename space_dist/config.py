@@ -623,6 +623,10 @@ class RolloutConfig(Section):
     start_states: int = Field(default=1, ge=1, le=1000)
     """Seeded start observations per instance whose mean value is its start value. One is exact where episodes start in
     one state (PointMass)."""
+    overlap: bool = False
+    """Collect a round while the update on the one before it runs, with the weights from before that update: for slow
+    environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO and A2C
+    without normalisation. Source: ours."""
 
 
 class BudgetConfig(Section):
@@ -717,6 +721,10 @@ class RunConfig(Section):
     """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
     """The one number from which every random number of the run comes."""
+    engine: Literal["auto", "single", "population"] = "single"
+    """How updates are computed. single: by SB3 itself. population: the same losses for many runs of one shape at once
+    (PPO and TRPO with MlpPolicy); a grid puts such runs together, and one alone has the same bits. auto: population
+    where the learner allows it; decided when a grid is frozen or a run begins. Part of what a run is."""
     env: EnvConfig
     instances: InstancesConfig
     curriculum: CurriculumConfig
@@ -727,6 +735,24 @@ class RunConfig(Section):
     checkpoint: CheckpointConfig = CheckpointConfig()
     tracking: TrackingConfig = TrackingConfig()
     resources: ResourcesConfig = ResourcesConfig()
+
+    @model_validator(mode="after")
+    def _overlap_is_possible(self) -> Self:
+        if not self.rollout.overlap:
+            return self
+        if not isinstance(self.learner, _OnPolicy):
+            raise ValueError(
+                f"rollout.overlap: true: learner.kind: {self.learner.kind} is off-policy, and learns from older rounds "
+                "anyway; it works with ppo, trpo and a2c"
+            )
+        if self.learner.normalize_observations or self.learner.normalize_rewards:
+            raise ValueError(
+                "rollout.overlap: true cannot be combined with learner.normalize_observations or "
+                "learner.normalize_rewards: a round's scales would not be those of its weights"
+            )
+        if self.engine == "population":
+            raise ValueError("rollout.overlap: true gains nothing with engine: population; use engine: single")
+        return self
 
     @model_validator(mode="after")
     def _whole_slots(self) -> Self:

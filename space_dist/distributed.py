@@ -180,10 +180,10 @@ class RayCluster:
         return _Piece(ray.put(value), value, kept=True)
 
     def collect(
-        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
     ) -> list[Handle]:
         """See `cluster.Cluster`."""
-        asked = {"round": round, "steps": steps, "selection_version": version}
+        asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
         shards = range(self._setup.shards)
         return [self._ask(shard, "collect", policy, selection, walk, shard=shard, **asked)[0] for shard in shards]
 
@@ -232,7 +232,9 @@ class RayCluster:
         arrived = dict(zip(wanted, values, strict=True))
         for piece in decided:  # the next decision needs it, and nobody could make it again
             piece.value, piece.kept = arrived[piece], True
-        self._unanswered.clear()
+        # What was asked for ahead of its time may still be lost before it is fetched.
+        self._unanswered = [call for call in self._unanswered
+                            if call.method == "collect" and not arrived.keys() >= set(call.answers)]  # fmt: skip
         return [handle.value if handle.kept else arrived[handle] for handle in handles]
 
     # ---- calls ----

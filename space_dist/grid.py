@@ -30,7 +30,7 @@ from space_dist.ledger import Lock
 from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, Run, label_of, load_grid
 from space_dist.provenance import code_digest, git_state, source_digest
 from space_dist.standing import Attempts, Ended, Standing, may_retry, standing_of, standings, unheard
-from space_dist.training import make_env, make_setup, total_steps
+from space_dist.training import make_env, make_setup, resolved, stack_of, total_steps
 
 log = logging.getLogger("space_dist")
 
@@ -39,6 +39,7 @@ _TICK_SECONDS = 0.2
 _ELSEWHERE_SECONDS = 2.0
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0
+MEMBERS = 32  # of a population, at most: more gain little, and are lost together
 
 
 # ---- from a file to a manifest --------------------------------------------------------------------------------------
@@ -158,16 +159,22 @@ def _cell(
     name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
     config = configs.parse({**data, "name": name}, where)
     with about(where):
+        config = resolved(config, can_share=grid.resources.workers == 0)
+        if config.engine == "population" and grid.resources.workers:
+            raise ConfigError(
+                f"engine: population with resources.workers: {grid.resources.workers}: runs that share a process have "
+                "no rollout actors of their own; use workers: 0, or engine: single"
+            )
         train, test = files.sets(config)
         make_setup(config, train, test)
         paths = [path for path in (config.env.id, getattr(config.learner, "policy", "")) if ":" in path]
         sources = {path: source_digest(path) for path in paths}
     identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
-    resolved = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
-    resolved["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
+    data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
+    data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
                              (("train", train), ("test", test))}  # fmt: skip
     steps = total_steps(config, make_env(config).horizon)
-    return Cell(identity[:CELL_ID_DIGITS], label, point, resolved), steps
+    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config)), steps
 
 
 def _distinct(cells: Any) -> tuple[Cell, ...]:
@@ -198,10 +205,17 @@ class Executor(Protocol):
     """Where runs are computed. No call blocks for longer than a moment."""
 
     def room(self) -> int:
-        """How many more runs can be started now and will not have to wait."""
+        """How many more times `start` can be called now without anything having to wait."""
 
-    def start(self, run: Run, attempt: int) -> None:
-        """Begin an attempt. Raises SpaceDistError if the place itself is gone."""
+    @property
+    def size(self) -> int:
+        """How much room there is if nothing runs."""
+
+    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+        """Begin attempts (runs, and which attempt of theirs), in one process that takes the room of one run.
+
+        Raises SpaceDistError if the place itself is gone.
+        """
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """Attempts that have ended since, and how; None where somebody else works on the run."""
@@ -234,9 +248,11 @@ class Conductor:
     ) -> None:  # fmt: skip
         self._grid, self._manifest, self._runs, self._executor = grid, manifest, runs, executor
         self._stop_requested, self._observe = stop_requested, observe
-        self._waiting: list[tuple[float, Run]] = []  # not before that time, by the monotonic clock
+        # Runs that wait, with the time (on the monotonic clock) before which they may not start: those that have begun
+        # go on before anything else begins.
+        self._interrupted: list[tuple[float, Run]] = []
+        self._fresh: list[tuple[float, Run]] = []
         self._live: dict[str, Run] = {}
-        self._begun: dict[str, bool] = {}  # whether a waiting run did, by its key
         self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._overview = Overview(len(runs))
@@ -245,7 +261,7 @@ class Conductor:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
         self._begin()
         looked = time.monotonic()
-        while self._waiting or self._live or self._elsewhere:
+        while self._interrupted or self._fresh or self._live or self._elsewhere:
             for run, ended in self._executor.poll():
                 self._settle(run, ended)
             if reason := self._asked_to_stop():
@@ -279,9 +295,9 @@ class Conductor:
         if standing.condition == "running":
             self._elsewhere[run.key] = run
         elif standing.condition == "waiting":
-            self._begun[run.key], self._steps[run.key] = standing.attempts > 0, standing.steps
-            self._waiting.append((time.monotonic() + delay, run))
-            self._waiting.sort(key=lambda entry: not self._begun[entry[1].key])  # which goes on before anything begins
+            self._steps[run.key] = standing.steps
+            waiting = self._interrupted if standing.attempts else self._fresh
+            waiting.append((time.monotonic() + delay, run))
         elif standing.condition == "failed":
             self._overview.failed += 1
             log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
@@ -289,22 +305,35 @@ class Conductor:
             self._overview.done += 1
 
     def _start_what_fits(self) -> None:
-        room, now = self._executor.room(), time.monotonic()
-        for entry in list(self._waiting):
-            if room <= 0:
-                break
-            if entry[0] > now:
-                continue
-            run, ledger = entry[1], self._grid.ledger(entry[1])
-            attempts = Attempts(ledger)
-            history = attempts.history()
-            if history.begun and history.last is None and not ledger.owner_alive():
-                # Nobody wrote how it ended: its supervisor is gone, too.
-                attempts.end(history.begun, unheard(history.where))
-            self._waiting.remove(entry)
-            self._executor.start(run, history.begun + 1)
-            self._live[run.key] = run
-            room -= 1
+        for _ in range(self._executor.room()):
+            if not (chosen := self._next()):
+                return
+            keys = {run.key for run in chosen}
+            self._interrupted = [entry for entry in self._interrupted if entry[1].key not in keys]
+            self._fresh = [entry for entry in self._fresh if entry[1].key not in keys]
+            self._executor.start([(run, self._next_attempt(run)) for run in chosen])
+            self._live |= {run.key: run for run in chosen}
+
+    def _next(self) -> list[Run]:
+        """The runs to be started next, side by side: one, or an equal share of those that can share a process."""
+        now = time.monotonic()
+        ready = [run for not_before, run in (*self._interrupted, *self._fresh) if not_before <= now]
+        if not ready or not ready[0].cell.stack:
+            return ready[:1]
+        alike = [run for run in ready if run.cell.stack == ready[0].cell.stack]
+        return alike[: min(MEMBERS, -(-len(alike) // max(1, self._executor.size - self._places_taken())))]
+
+    def _places_taken(self) -> int:
+        return self._executor.size - self._executor.room() if self._live else 0
+
+    def _next_attempt(self, run: Run) -> int:
+        ledger = self._grid.ledger(run)
+        attempts = Attempts(ledger)
+        history = attempts.history()
+        if history.begun and history.last is None and not ledger.owner_alive():
+            # Nobody wrote how it ended: its supervisor is gone, too.
+            attempts.end(history.begun, unheard(history.where))
+        return history.begun + 1
 
     def _settle(self, run: Run, ended: Ended | None) -> None:
         self._live.pop(run.key, None)
@@ -346,7 +375,7 @@ class Conductor:
     def _show(self) -> None:
         overview = self._overview
         overview.running = list(self._live.values())
-        overview.waiting = len(self._waiting) + len(self._elsewhere)
+        overview.waiting = len(self._interrupted) + len(self._fresh) + len(self._elsewhere)
         self._observe(overview)
 
 

@@ -23,7 +23,9 @@ class StopRequests:
     the same exit code. A second SIGINT ends it at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shared: StopRequests | None = None) -> None:
+        """shared: whose signals also ask this one; its file does not."""
+        self._shared = shared
         self._reason: str | None = None
         self._file: Path | None = None
         self._grace_seconds = 25.0
@@ -56,14 +58,18 @@ class StopRequests:
     def watch(self, stop_file: Path, grace_seconds: float) -> None:
         """Also stop once `stop_file` exists."""
         self._file, self._grace_seconds = stop_file, grace_seconds
+        if self._shared is not None:
+            self._shared._grace_seconds = grace_seconds
 
     @property
     def signalled(self) -> str | None:
         """The signal that asked to stop, if one did."""
-        return self._reason
+        return self._reason if self._shared is None else self._shared.signalled
 
     def reason(self) -> str | None:
         """Why to stop, or None."""
+        if self._shared is not None and self._reason is None:
+            self._reason = self._shared.signalled
         if self._reason is None and self._file is not None and self._file.exists():
             self._reason = f"the file {self._file}"
         return self._reason

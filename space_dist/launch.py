@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import io
 import json
 import logging
@@ -30,7 +31,7 @@ from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
 from space_dist.policy import Policy, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
-from space_dist.training import Progress, Training, make_env, make_setup, policy_in
+from space_dist.training import Progress, Training, make_env, make_setup, policy_in, resolved
 
 log = logging.getLogger("space_dist")
 
@@ -87,18 +88,58 @@ def launch(
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
     SpaceDistError after noting it in the run's status.
     """
+    with begun(config, folder, resume=resume, stop=stop) as course:
+        if not course.outcome.already_done:
+            with _cluster(config, course.setup, stop) as cluster:
+                course.training(cluster, observe).run()
+    return course.finished()
+
+
+@dataclass
+class Course:
+    """A run that is this process's own now. outcome: how it ends; `already_done` where there is nothing to do."""
+
+    config: RunConfig
+    setup: Setup
+    writer: RunWriter
+    status: Status
+    stop: StopRequests
+    outcome: Outcome
+    pusher: subprocess.Popen[bytes] | None = None
+
+    def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
+        """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
+        _stop_if_asked(self.writer, self.stop)
+        return Training(
+            self.config, self.setup, cluster, self.writer,
+            status=self.status, stop_requested=self.stop.reason, observe=observe,
+        )  # fmt: skip
+
+    def finished(self) -> Outcome:
+        """How it ended, once MLflow's mirror has what it can have."""
+        return replace(self.outcome, tracking_warning=_final_push(self.config, self.outcome.ledger, self.pusher))
+
+
+@contextlib.contextmanager
+def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
+    """Make the folder this run's, for as long as the context lasts. What is raised within is noted in its status.
+
+    Raises as `launch` does.
+    """
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
-    ledger = Ledger(folder)
+    ledger, config = Ledger(folder), resolved(config)
     train, test = read_instances(config)
     setup = make_setup(config, train, test)
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
         status = _claim(config, setup, writer)
-        if status.state == "done":
-            return Outcome(ledger, already_done=True)
+        course = Course(config, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
+        if course.outcome.already_done:
+            yield course
+            return
         stop.watch(ledger.stop_file, config.resources.grace_seconds)
-        pusher = _start_pusher(config, ledger)
+        course.pusher = _start_pusher(config, ledger)
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
@@ -107,12 +148,7 @@ def launch(
                 )
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
             _stop_if_asked(writer, stop)  # before Ray is started
-            with _cluster(config, setup, stop) as cluster:
-                _stop_if_asked(writer, stop)
-                Training(
-                    config, setup, cluster, writer, status=status, stop_requested=stop.reason, observe=observe
-                ).run()
-    return Outcome(ledger, tracking_warning=_final_push(config, ledger, pusher))
+            yield course
 
 
 def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
@@ -325,6 +361,10 @@ def _note_failure(writer: RunWriter, message: str) -> None:
             writer.set_status(replace(writer.status, state="failed", message=message[:2000], updated_at=time.time()))
 
 
+speaking: contextvars.ContextVar[Path | None] = contextvars.ContextVar("speaking", default=None)
+"""The folder of the run that this process advances now, where it advances several: whose log it writes."""
+
+
 @contextlib.contextmanager
 def _logging_to(path: Path) -> Iterator[None]:
     try:
@@ -332,6 +372,7 @@ def _logging_to(path: Path) -> Iterator[None]:
     except OSError as error:
         raise LedgerError(f"cannot write {path}: {error.strerror}") from None
     handler.handleError = lambda record: None  # type: ignore[method-assign] # a full disk is the ledger's to tell
+    handler.addFilter(lambda record: speaking.get() in (None, path.parent))
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     log.addHandler(handler)
     log.setLevel(logging.INFO)

@@ -262,12 +262,14 @@ class Cell:
 
     id: 12 hex digits of the identity of its config. label: unique in the grid. settings: value by axis of the grid.
     config: a resolved run config as plain data, its instance paths relative to the grid's folder.
+    stack: equal for cells whose runs can share a process (`engine: population`); empty for runs that work alone.
     """
 
     id: str
     label: str
     settings: Mapping[str, Any]
     config: Mapping[str, Any]
+    stack: str = ""
 
     @property
     def budget_steps(self) -> int:
@@ -355,8 +357,8 @@ class Manifest:
         """The content of manifest.json, with its own SHA-256; the same manifest gives the same bytes."""
         data: dict[str, Any] = {
             "format": FORMAT, "name": self.name, "axes": list(self.axes),
-            "cells": [{"id": cell.id, "label": cell.label, "settings": cell.settings, "config": cell.config}
-                      for cell in self.cells],
+            "cells": [{"id": cell.id, "label": cell.label, "settings": cell.settings, "config": cell.config,
+                       **({"stack": cell.stack} if cell.stack else {})} for cell in self.cells],
             "seeds": list(self.seeds),
             "resources": self.resources.model_dump(), "retry": self.retry.model_dump(),
             "tracking": self.tracking.model_dump(),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -130,6 +130,13 @@ class Noise:
             return cls(drawn, nothing)
         return cls(drawn, random.random(size=drawn.shape, dtype=np.float32))
 
+    @classmethod
+    def joined(cls, parts: Sequence[Noise]) -> Noise:
+        """The numbers of several shards, whose slots lie one after another."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("drawn", "uniform")))
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -157,12 +164,8 @@ class Valuing(Protocol):
         """`(n, obs_dim) -> (n, ...)` what the states are worth, in unscaled reward units."""
 
 
-class Policy(Protocol):
-    """A policy and its value function as of one update."""
-
-    @property
-    def version(self) -> int:
-        """How many updates made it."""
+class Acting(Protocol):
+    """Whatever acts."""
 
     @property
     def head(self) -> Head:
@@ -170,6 +173,14 @@ class Policy(Protocol):
 
     def outputs(self, observations: Observations) -> Array:
         """`(n, obs_dim) -> (n, n_outputs)` for the head."""
+
+
+class Policy(Acting, Protocol):
+    """A policy and its value function as of one update."""
+
+    @property
+    def version(self) -> int:
+        """How many updates made it."""
 
     def values(self, observations: Observations) -> NDArray[np.float64]:
         """`(n, obs_dim) -> (n,)` what the states are worth, in unscaled reward units."""
@@ -269,8 +280,51 @@ def blind(policy: Policy, action_space: spaces.Space[Any], version: int) -> Blin
     return BlindPolicy(version, head, 2 * n_actions if head.kind == "squashed" else n_actions)
 
 
+def side_by_side(policies: Sequence[Policy], rows: int) -> Acting:
+    """One policy that acts for several, of which each has `rows` rows of the observations, in order.
+
+    Each acts as it does alone, bit for bit. Raises TypeError for several that are not multilayer perceptrons of one
+    shape with the same kind of head, Gaussian or categorical.
+    """
+    if len(policies) == 1:
+        return policies[0]
+    return _SideBySide(policies, rows)
+
+
+class _SideBySide:
+    def __init__(self, policies: Sequence[Policy], rows: int) -> None:
+        mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
+        first = mlps[0] if mlps else None
+        if first is None or len(mlps) < len(policies) or {one.head.kind for one in mlps} - {"gaussian", "categorical"}:
+            raise TypeError("only multilayer perceptrons with Gaussian or categorical heads act side by side")
+        if len({(one.head.kind, one.activation, *(weight.shape for weight, _ in one.actor)) for one in mlps}) > 1:
+            raise TypeError("only policies of one shape act side by side")
+        self._shape, self._activation = (len(mlps), rows), first.activation
+        self._layers = tuple(
+            (np.stack([weight for weight, _ in layer]), np.stack([bias for _, bias in layer])[:, None])
+            for layer in zip(*(one.actor for one in mlps), strict=True)
+        )
+        self._statistics = _stacked([one.statistics for one in mlps])
+        self.head = first.head
+        if first.head.log_std is not None:
+            log_std = np.stack([one.head.log_std for one in mlps if one.head.log_std is not None])
+            self.head = dataclasses.replace(first.head, log_std=np.repeat(log_std, rows, axis=0))
+
+    def outputs(self, observations: Observations) -> Array:
+        inputs = _flat(self._statistics.scaled(_flat(observations).reshape(*self._shape, -1)))
+        return forward(self._layers, self._activation, inputs).reshape(self._shape[0] * self._shape[1], -1)
+
+
+def _stacked(statistics: Sequence[Statistics]) -> Statistics:
+    """Scales of observations for `(len(statistics), rows, obs_dim)` of them; all are normalised or none is."""
+    if statistics[0].mean is None:
+        return Statistics()
+    means, stds = ([getattr(one, name) for one in statistics] for name in ("mean", "std"))
+    return Statistics(np.stack(means)[:, None], np.stack(stds)[:, None])
+
+
 def forward(layers: Layers, activation: Activation, inputs: Array) -> Array:
-    """`(n, n_in) -> (n, n_out)`; the last layer is linear."""
+    """`(n, n_in) -> (n, n_out)`; the last layer is linear. Leading axes of layers and inputs are stacks of networks."""
     for weights, biases in layers[:-1]:
         inputs = inputs @ weights
         inputs += biases

@@ -33,7 +33,7 @@ from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
 from space_dist.standing import Attempts, Cause, Ended, Standing
-from space_dist.supervisor import ray_answers
+from space_dist.supervisor import Turn, ray_answers
 
 log = logging.getLogger("space_dist")
 
@@ -163,7 +163,7 @@ class Jobs:
         # The conductor's own code is the runs': its uploaded folder, if it came with one.
         self._runtime_env = {key: value for key, value in dict(context.runtime_env).items()
                              if key in ("working_dir", "py_modules")}  # fmt: skip
-        self._live: dict[str, tuple[Run, int]] = {}
+        self._live: dict[str, list[tuple[Run, int]]] = {}
         self._looked = 0.0
 
     def __enter__(self) -> Jobs:
@@ -182,19 +182,29 @@ class Jobs:
         known = {run.key: run for run in runs}
         for job in self._client.list_jobs():
             metadata = job.metadata or {}
-            run = known.get(f"{metadata.get('cell')}/s{metadata.get('seed')}")
-            if run is None or metadata.get("folder") != str(self._grid.folder) or job.status not in _LIVE:
+            if metadata.get("folder") != str(self._grid.folder) or job.status not in _LIVE:
                 continue
-            self._live[str(job.submission_id)] = (run, int(metadata["attempt"]))
-        return [run for run, _ in self._live.values()]
+            turns = [Turn.parse(text) for text in metadata.get("runs", "").split()]
+            mine = [(known[key], turn.attempt) for turn in turns if (key := f"{turn.cell}/s{turn.seed}") in known]
+            if mine:
+                self._live[str(job.submission_id)] = mine
+        return [run for turns in self._live.values() for run, _ in turns]
 
-    def start(self, run: Run, attempt: int) -> None:
+    @property
+    def size(self) -> int:
         """See `grid.Executor`."""
+        return self._max
+
+    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+        """See `grid.Executor`. A job of several runs is named after the first, and after how many it has."""
+        (run, attempt), more = turns[0], f"-p{len(turns)}" if len(turns) > 1 else ""
         while True:
-            job = f"{_job_name(self._manifest)}-{run.cell.id}-s{run.seed}-a{attempt}"
+            job = f"{_job_name(self._manifest)}-{run.cell.id}-s{run.seed}-a{attempt}{more}"
+            all_turns = [Turn(run.cell.id, run.seed, attempt), *(Turn(one.cell.id, one.seed, number)
+                                                                 for one, number in turns[1:])]  # fmt: skip
             command = [
-                sys.executable, "-m", "space_dist.cli", "grid", "work", str(self._grid.folder), run.cell.id,
-                "--seed", str(run.seed), "--attempt", str(attempt), "--nonce", self._nonce.text, "--job", job,
+                sys.executable, "-m", "space_dist.cli", "grid", "work", str(self._grid.folder), *map(str, all_turns),
+                "--nonce", self._nonce.text, "--job", job,
             ]  # fmt: skip
             grace = self._manifest.resources.grace_seconds
             environment = {"RAY_JOB_STOP_WAIT_TIME_S": str(int(grace) + 30), "PYTHONUNBUFFERED": "1"}
@@ -204,13 +214,14 @@ class Jobs:
                 metadata={
                     "grid": self._manifest.name, "folder": str(self._grid.folder), "cell": run.cell.id,
                     "label": run.cell.label, "seed": str(run.seed), "attempt": str(attempt),
+                    "runs": " ".join(map(str, all_turns)),
                     "code": self._manifest.code, **self._manifest.git,
                 },
             )  # fmt: skip
             if not taken and ((details := self._details(job)) is None or details.status not in _LIVE):
                 attempt += 1  # an id can be used once, even if its job never began
                 continue
-            self._live[job] = (run, attempt)
+            self._live[job] = [(run, attempt), *turns[1:]]
             return
 
     def _details(self, job: str) -> JobDetails | None:
@@ -225,13 +236,13 @@ class Jobs:
             return []
         self._looked = time.monotonic()
         ended: list[tuple[Run, Ended | None]] = []
-        for job, (run, attempt) in list(self._live.items()):
+        for job, turns in list(self._live.items()):
             details = self._details(job)
             if details is not None and details.status in _LIVE:
-                self._end_if_silent(job, run, attempt)
+                self._end_if_silent(job, *turns[0])
                 continue
             del self._live[job]
-            ended.append((run, self._how(run, attempt, details)))
+            ended += [(run, self._how(run, attempt, details)) for run, attempt in turns]
         return ended
 
     def _how(self, run: Run, attempt: int, details: JobDetails | None) -> Ended | None:

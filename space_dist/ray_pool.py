@@ -31,8 +31,8 @@ from ray.exceptions import RayActorError, RayError
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import Attempts, Cause, Ended
-from space_dist.supervisor import STOPPED_SECONDS, Task, ray_answers
+from space_dist.standing import Attempts, Cause, Ended, is_done
+from space_dist.supervisor import STOPPED_SECONDS, Task, Turn, ray_answers
 
 log = logging.getLogger("space_dist")
 
@@ -113,8 +113,7 @@ class _Slot:
     hired: float
     sign: Any
     node: str | None = None
-    run: Run | None = None
-    attempt: int = 0
+    turns: Sequence[tuple[Run, int]] = ()
     answer: Any = None
     heard: float = 0.0
 
@@ -151,13 +150,19 @@ class Pool:
 
     def room(self) -> int:
         """See `grid.Executor`. A worker that Ray has no CPU for yet is no room."""
-        return sum(slot.run is None and slot.node is not None for slot in self._slots)
+        return sum(not slot.turns and slot.node is not None for slot in self._slots)
 
-    def start(self, run: Run, attempt: int) -> None:
+    @property
+    def size(self) -> int:
         """See `grid.Executor`."""
-        slot = next(slot for slot in self._slots if slot.run is None and slot.node is not None)
-        task = Task(str(self._grid.folder), run.cell.id, run.seed, attempt, self._address)
-        slot.run, slot.attempt, slot.heard = run, attempt, time.monotonic()
+        return self._size
+
+    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+        """See `grid.Executor`."""
+        slot = next(slot for slot in self._slots if not slot.turns and slot.node is not None)
+        each = tuple(Turn(run.cell.id, run.seed, attempt) for run, attempt in turns)
+        task = Task(str(self._grid.folder), each, self._address)
+        slot.turns, slot.heard = turns, time.monotonic()
         slot.answer = slot.actor.attempt.remote(dataclasses.asdict(task))
 
     def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a pool does not outlive its conductor
@@ -167,19 +172,19 @@ class Pool:
     def stop(self) -> None:
         """See `grid.Executor`."""
         for slot in self._slots:
-            if slot.run is not None:
+            if slot.turns:
                 slot.actor.stop.remote(Cause.STOPPED.value)
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
         ended: list[tuple[Run, Ended | None]] = []
         for index, slot in enumerate(self._slots):
-            run, attempt = slot.run, slot.attempt
+            turns = slot.turns
             try:
-                if run is not None and ray.wait([slot.answer], timeout=0)[0]:
+                if turns and ray.wait([slot.answer], timeout=0)[0]:
                     message = ray.get(slot.answer)
-                    slot.run = slot.answer = None
-                    ended.append((run, self._understood(run, attempt, message)))
+                    slot.turns, slot.answer = (), None
+                    ended += self._understood(turns, message)
                 else:
                     self._listen(slot)
             except RayActorError as error:
@@ -192,23 +197,31 @@ class Pool:
                 log.warning("lost a worker of the pool: %s", str(error).splitlines()[0][:200])
                 lost = self._lost(slot)
                 self._slots[index] = self._hire()
-                if run is not None:
-                    Attempts(self._grid.ledger(run)).end(attempt, lost)
-                    ended.append((run, lost))
+                ended += self._all_lost(turns, lost)
         if all(slot.node is None and time.monotonic() - slot.hired > _START_SECONDS for slot in self._slots):
             raise SpaceDistError(
                 f"Ray did not start a worker of one CPU within {_START_SECONDS:.0f} s; {_cpus()} CPUs are free"
             )
         return ended
 
-    def _understood(self, run: Run, attempt: int, message: dict[str, Any] | None) -> Ended | None:
+    def _understood(
+        self, turns: Sequence[tuple[Run, int]], message: dict[str, Any] | None
+    ) -> list[tuple[Run, Ended | None]]:  # fmt: skip
         if message is None:
-            lost = self._unless_all_end(Ended(Cause.KILLED, "its supervisor was killed"))
-            Attempts(self._grid.ledger(run)).end(attempt, lost)
-            return lost
-        if message["busy"]:
-            return None
-        return Ended(None if message["cause"] is None else Cause(message["cause"]), message["detail"])
+            return self._all_lost(turns, self._unless_all_end(Ended(Cause.KILLED, "its supervisor was killed")))
+        return [
+            (run, None if end["busy"] else Ended(None if end["cause"] is None else Cause(end["cause"]), end["detail"]))
+            for (run, _), end in zip(turns, message["ends"], strict=True)
+        ]
+
+    def _all_lost(self, turns: Sequence[tuple[Run, int]], lost: Ended) -> list[tuple[Run, Ended | None]]:
+        """Those that are done are done; nobody but us can say how the others ended."""
+        ended: list[tuple[Run, Ended | None]] = []
+        for run, attempt in turns:
+            done = Ended(None) if is_done(self._grid.ledger(run)) else lost
+            Attempts(self._grid.ledger(run)).end(attempt, done)
+            ended.append((run, done))
+        return ended
 
     def _listen(self, slot: _Slot) -> None:
         """Ask for a sign of life now and then; whoever gives none for too long is killed, and found dead next time."""

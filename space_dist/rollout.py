@@ -8,7 +8,7 @@ often, it gives the same bits.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from space_dist.envs import BatchedEnv, Observations, make_batched
 from space_dist.envs.observations import allocate, concatenate, put, rows, take
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.policy import Noise, Policy, Valuing
+from space_dist.policy import Noise, Policy, Valuing, side_by_side
 from space_dist.seeding import Purpose, episode_seeds, generator
 
 FloatArray = NDArray[np.float64]
@@ -102,6 +102,12 @@ class Outcomes:
     success: FloatArray
     backward_discounted_returns: FloatArray
 
+    @classmethod
+    def none(cls, policy_version: int) -> Outcomes:
+        """Of no episodes."""
+        nothing = np.zeros(0)
+        return cls(policy_version, nothing, nothing, nothing.astype(np.int64), nothing, nothing)
+
 
 @dataclass(frozen=True)
 class Walk:
@@ -123,6 +129,40 @@ class Walk:
         """`(episodes,)` the places in `selection` of a shard's next episodes."""
         places: IntArray = (self.position(selection, shard, n_shards) + np.arange(episodes)) % len(selection.ids)
         return places
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One shard to be collected: all from fresh resets, walking `selection` from `start`.
+
+    steps: environment steps of the run before this shard's first, in the order of a replay buffer (time, then slots).
+    """
+
+    policy: Policy
+    selection: Selection
+    start: int
+    gamma: float
+    seed: int
+    round: int
+    shard: int
+    steps: int = 0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Episodes to be measured, one per row of `contexts` (k, d), with `seeds` (k,).
+
+    Deterministic ones, unless there is `random` to act with.
+    """
+
+    policy: Policy
+    contexts: FloatArray
+    seeds: NDArray[np.uint64]
+    gamma: float
+    random: np.random.Generator | None = None
+
+    def __len__(self) -> int:
+        return len(self.seeds)
 
 
 @dataclass(frozen=True)
@@ -167,6 +207,42 @@ class Setup:
         """Pieces into which the evaluation of one split is cut."""
         return self.shards
 
+    def rollout(
+        self, policy: Policy, selection: Selection, walk: Walk,
+        *, round: int, steps: int, shard: int, selection_version: int, lag: int = 0,
+    ) -> Rollout:  # fmt: skip
+        """One shard of one round, which begins after `steps` environment steps.
+
+        lag: updates that the policy is behind. Raises RuntimeError if policy or selection are not the ones asked for.
+        """
+        if selection.version != selection_version or policy.version != round - lag:
+            raise RuntimeError(
+                f"round {round} asked for selection {selection_version} and policy {round - lag}, "
+                f"and got selection {selection.version} and policy {policy.version}"
+            )
+        return Rollout(
+            policy, selection, start=walk.position(selection, shard, self.shards), gamma=self.gamma, seed=self.seed,
+            round=round, shard=shard, steps=steps + shard * self.slots * self.slot_length,
+        )  # fmt: skip
+
+    def trial(self, policy: Policy, split: Split, part: int, *, stochastic: bool = False) -> Trial:
+        """Episodes on one part of a split: deterministic ones, or `stochastic` ones for the released code's metric."""
+        instances, number = self.instances(split), 0 if split == "train" else 1
+        count = len(instances) * self.evaluation_episodes
+        mine = np.array_split(np.arange(count), self.evaluation_parts)[part]
+        return Trial(
+            policy, instances.contexts[mine // self.evaluation_episodes],
+            episode_seeds(self.seed, Purpose.EVALUATION, number, count=count)[mine], self.gamma,
+            generator(self.seed, Purpose.EVALUATION, 2 + number, part) if stochastic else None,
+        )  # fmt: skip
+
+    def probe(self, policy: Policy, indices: IntArray, version: int, part: int) -> Trial:
+        """Episodes of the acting policy, noise and all, on one part of the training instances at (k,) `indices`."""
+        seeds = episode_seeds(self.seed, Purpose.PROBE_EPISODES, version, count=len(indices))
+        mine = np.array_split(np.arange(len(indices)), self.evaluation_parts)[part]
+        random = generator(self.seed, Purpose.PROBE_EPISODES, version, part)
+        return Trial(policy, self.train.contexts[indices[mine]], seeds[mine], self.gamma, random)
+
 
 class Worker:
     """Computes pieces of a run's work. What it keeps between calls are environments and start observations: caches."""
@@ -178,26 +254,13 @@ class Worker:
         self._scoring: BatchedEnv | None = None
         self._starts: dict[int, Observations] = {}
 
-    def collect(
-        self, policy: Policy, selection: Selection, walk: Walk,
-        *, round: int, steps: int, shard: int, selection_version: int,
-    ) -> Shard:  # fmt: skip
-        """One shard of one round, which begins after `steps` environment steps.
-
-        Raises RuntimeError if policy or selection are not the ones asked for.
-        """
-        if selection.version != selection_version or policy.version != round:
-            raise RuntimeError(
-                f"round {round} asked for selection {selection_version} and policy {round}, "
-                f"and got selection {selection.version} and policy {policy.version}"
-            )
+    def collect(self, policy: Policy, selection: Selection, walk: Walk, **asked: int) -> Shard:
+        """One shard of one round; `asked`: see `Setup.rollout`."""
         setup = self._setup
         return collect(
-            self._collecting, policy, selection,
-            start=walk.position(selection, shard, setup.shards), length=setup.slot_length, gamma=setup.gamma,
-            seed=setup.seed, round=round, shard=shard, steps=steps + shard * setup.slots * setup.slot_length,
+            self._collecting, [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
-        )  # fmt: skip
+        )[0]  # fmt: skip
 
     def start_values(self, policy: Valuing, chunk: int) -> FloatArray:
         """`(chunk_size, ...)` V(s0, c_i) of one chunk of the training instances: means over their start observations.
@@ -228,78 +291,62 @@ class Worker:
         return means
 
     def probe(self, policy: Policy, indices: IntArray, version: int, part: int) -> Outcomes:
-        """Episodes of the acting policy, noise and all, on one part of the training instances at (k,) `indices`."""
-        setup = self._setup
-        seeds = episode_seeds(setup.seed, Purpose.PROBE_EPISODES, version, count=len(indices))
-        mine = np.array_split(np.arange(len(indices)), setup.evaluation_parts)[part]
-        random = generator(setup.seed, Purpose.PROBE_EPISODES, version, part)
-        return self._episodes(policy, setup.train.contexts[indices[mine]], seeds[mine], random)
+        """See `Setup.probe`."""
+        return self._measured(self._setup.probe(policy, indices, version, part))
 
     def evaluate(self, policy: Policy, split: Split, part: int, *, stochastic: bool = False) -> Outcomes:
-        """Episodes on one part of a split: deterministic ones, or `stochastic` ones for the released code's metric."""
-        setup, instances = self._setup, self._setup.instances(split)
-        episodes = setup.evaluation_episodes
-        seeds = episode_seeds(
-            setup.seed, Purpose.EVALUATION, 0 if split == "train" else 1, count=len(instances) * episodes
-        )
-        contexts = np.repeat(instances.contexts, episodes, axis=0)
-        mine = np.array_split(np.arange(len(seeds)), setup.evaluation_parts)[part]
-        random = generator(setup.seed, Purpose.EVALUATION, 2 if split == "train" else 3, part) if stochastic else None
-        return self._episodes(policy, contexts[mine], seeds[mine], random)
+        """See `Setup.trial`."""
+        return self._measured(self._setup.trial(policy, split, part, stochastic=stochastic))
 
-    def _episodes(
-        self, policy: Policy, contexts: FloatArray, seeds: NDArray[np.uint64], random: np.random.Generator | None
-    ) -> Outcomes:
-        """One episode for each of the (k, d) contexts, at once, on environments of their own."""
-        count = len(contexts)
-        if not count:
-            nothing = np.zeros(0)
-            return Outcomes(policy.version, nothing, nothing, nothing.astype(np.int64), nothing, nothing)
-        if count not in self._evaluating:
-            self._evaluating[count] = self._setup.make_env(count)
-        env = self._evaluating[count]
-        noise = None
-        if random is not None:
-            noise = Noise.draw(policy.head, env.action_space, random, (env.horizon, env.n_slots))
-        return evaluate(env, policy, contexts, seeds, gamma=self._setup.gamma, noise=noise)
+    def _measured(self, trial: Trial) -> Outcomes:
+        """On an environment of its own, so that measuring never changes what is collected."""
+        if not len(trial):
+            return Outcomes.none(trial.policy.version)
+        if len(trial) not in self._evaluating:
+            self._evaluating[len(trial)] = self._setup.make_env(len(trial))
+        return evaluate(self._evaluating[len(trial)], [trial])[0]
 
 
 def collect(
-    env: BatchedEnv, policy: Policy, selection: Selection,
-    *, start: int, length: int, gamma: float, seed: int, round: int, shard: int, steps: int = 0,
-    episodes: int | None = None, keep_next_observations: bool = False,
-) -> Shard:  # fmt: skip
-    """Collect exactly `length * env.n_slots` transitions, all from fresh resets, walking `selection` from `start`.
+    env: BatchedEnv, rollouts: Sequence[Rollout], *, length: int, episodes: int | None = None,
+    keep_next_observations: bool = False,
+) -> list[Shard]:  # fmt: skip
+    """Collect `length * slots` transitions for each rollout, side by side: an equal share of the slots is each one's.
 
-    Slots that end their episode at the same step take the next instances in slot order. The last episode of a slot is
-    cut where the round ends. With `episodes`, which takes a single slot, the round ends when that many have.
-    steps: environment steps of the run before this shard's first, in the order of a replay buffer (time, then slots).
+    A shard has the same bits whoever is collected beside it. Slots that end their episode at the same step take the
+    next instances in slot order. The last episode of a slot is cut where the round ends. With `episodes`, which takes
+    a single rollout and slot, the round ends when that many have.
     """
-    n = env.n_slots
-    seeds = episode_seeds(seed, Purpose.EPISODES, round, shard, count=n * length)
-    noise = Noise.draw(policy.head, env.action_space, generator(seed, Purpose.ACTIONS, round, shard), (length, n))
-    observations = allocate(env.observation_space, length, n)
-    following = allocate(env.observation_space, length, n) if keep_next_observations else None
-    rewards = np.empty((length, n))
-    terminated = np.zeros((length, n), dtype=np.bool_)
-    truncated = np.zeros((length, n), dtype=np.bool_)
+    slots = env.n_slots // len(rollouts)
+    walk = _Walking(rollouts, slots, length)
+    acting = side_by_side([rollout.policy for rollout in rollouts], slots)
+    noise = Noise.joined([
+        Noise.draw(one.policy.head, env.action_space, generator(one.seed, Purpose.ACTIONS, one.round, one.shard),
+                   (length, slots))
+        for one in rollouts
+    ])  # fmt: skip
+    first_steps = np.concatenate([rollout.steps + np.arange(slots) for rollout in rollouts])
+    observations = allocate(env.observation_space, length, env.n_slots)
+    following = allocate(env.observation_space, length, env.n_slots) if keep_next_observations else None
+    rewards = np.empty((length, env.n_slots))
+    terminated = np.zeros((length, env.n_slots), dtype=np.bool_)
+    truncated = np.zeros((length, env.n_slots), dtype=np.bool_)
     actions: list[NDArray[np.generic]] = []
     last: list[Observations] = []
-    table = _EpisodeTable(n, gamma)
+    table = _EpisodeTable(np.repeat([rollout.gamma for rollout in rollouts], slots))
 
-    current = allocate(env.observation_space, n)
-    ended = np.arange(n)
+    current = allocate(env.observation_space, env.n_slots)
+    ended = np.arange(env.n_slots)
     for time in range(length):
         if len(ended):
             if episodes is not None and len(table) == episodes:
                 length = time
                 break
-            first = len(table)
-            places = (start + first + np.arange(len(ended))) % len(selection.ids)
-            put(current, ended, env.reset(ended, selection.contexts[places], seeds[first : first + len(ended)]))
-            table.begin(ended, selection.ids[places], time)
-        stored = policy.head.sampled(policy.outputs(current), noise, time, steps + time * n + np.arange(n))
-        step = env.step(policy.head.executed(stored))
+            ids, contexts, seeds = walk.next(ended)
+            put(current, ended, env.reset(ended, contexts, seeds))
+            table.begin(ended, ids, time)
+        stored = acting.head.sampled(acting.outputs(current), noise, time, first_steps + time * slots)
+        step = env.step(acting.head.executed(stored))
         put(observations, time, current)
         rewards[time] = step.rewards
         terminated[time], truncated[time] = step.terminated, step.truncated & ~step.terminated
@@ -312,32 +359,73 @@ def collect(
         table.end(ended, np.where(terminated[time], TERMINATED, TRUNCATED)[ended])
         put(current, slice(None), step.observations)
     table.end(table.running(), np.full(len(table.running()), CUT))
-    return Shard(
-        shard=shard, round=round, policy_version=policy.version,
-        selection_version=selection.version, order_version=selection.order_version,
-        observations=take(observations, slice(length)), actions=np.stack(actions), rewards=rewards[:length],
-        terminated=terminated[:length], truncated=truncated[:length],
-        last_observations=current, truncated_observations=concatenate(last),
-        next_observations=None if following is None else take(following, slice(length)), episodes=table.episodes(),
-    )  # fmt: skip
+    stored, lasts = np.stack(actions), concatenate(last)
+    owners = np.nonzero(truncated[:length])[1] // slots  # of each last observation
+    shards = []
+    for index, (rollout, told) in enumerate(zip(rollouts, table.episodes(len(rollouts)), strict=True)):
+        mine = (slice(length), slice(index * slots, (index + 1) * slots))
+        shards.append(
+            Shard(
+                shard=rollout.shard, round=rollout.round, policy_version=rollout.policy.version,
+                selection_version=rollout.selection.version, order_version=rollout.selection.order_version,
+                observations=take(observations, mine), actions=stored[mine].copy(), rewards=rewards[mine].copy(),
+                terminated=terminated[mine].copy(), truncated=truncated[mine].copy(),
+                last_observations=take(current, mine[1]), truncated_observations=take(lasts, owners == index),
+                next_observations=None if following is None else take(following, mine), episodes=told,
+            )
+        )  # fmt: skip
+    return shards
 
 
-def evaluate(
-    env: BatchedEnv, policy: Policy, contexts: FloatArray, seeds: NDArray[np.uint64],
-    *, gamma: float, noise: Noise | None = None,
-) -> Outcomes:  # fmt: skip
-    """One episode per row of `contexts` (n_slots, d), at once; deterministic unless there is `noise` to act with."""
-    slots = np.arange(env.n_slots)
+class _Walking:
+    """Which instance, with which seed, each slot's next episode has, over several rollouts of `slots` slots each."""
+
+    def __init__(self, rollouts: Sequence[Rollout], slots: int, length: int) -> None:
+        self._slots = slots
+        self._begun = np.zeros(len(rollouts), dtype=np.int64)
+        self._starts = np.array([rollout.start for rollout in rollouts])
+        self._sizes = np.array([len(rollout.selection.ids) for rollout in rollouts])
+        self._firsts = np.cumsum(self._sizes) - self._sizes  # of each rollout's instances among all
+        self._ids = np.concatenate([rollout.selection.ids for rollout in rollouts])
+        self._contexts = np.concatenate([rollout.selection.contexts for rollout in rollouts])
+        self._seeds = np.stack([
+            episode_seeds(one.seed, Purpose.EPISODES, one.round, one.shard, count=slots * length) for one in rollouts
+        ])  # fmt: skip
+
+    def next(self, slots: IntArray) -> tuple[IntArray, FloatArray, NDArray[np.uint64]]:
+        """(k,) ids, (k, d) contexts and (k,) seeds of the episodes that begin in `slots` (k,), which ascend."""
+        owners = slots // self._slots
+        numbers = self._begun[owners] + np.arange(len(slots)) - np.searchsorted(owners, owners)
+        self._begun += np.bincount(owners, minlength=len(self._begun))
+        places = self._firsts[owners] + (self._starts[owners] + numbers) % self._sizes[owners]
+        return self._ids[places], self._contexts[places], self._seeds[owners, numbers]
+
+
+def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
+    """Measure trials of equally many episodes side by side, all at once, all deterministic or none.
+
+    The outcomes of one have the same bits whatever is measured beside it.
+    """
+    count, slots, n_slots = len(trials[0]), np.arange(env.n_slots), env.n_slots
+    acting = side_by_side([trial.policy for trial in trials], count)
+    noise = None
+    if trials[0].random is not None:
+        shape = (env.horizon, count)
+        noise = Noise.joined([Noise.draw(trial.policy.head, env.action_space, trial.random, shape)
+                              for trial in trials if trial.random is not None])  # fmt: skip
+    contexts = np.concatenate([trial.contexts for trial in trials])
+    seeds = np.concatenate([trial.seeds for trial in trials])
+    gamma = np.repeat([trial.gamma for trial in trials], count)
     observations = take(env.reset(slots, contexts, seeds), slice(None))
-    alive = np.ones(env.n_slots, dtype=np.bool_)
-    returns, discounted, success = np.zeros(env.n_slots), np.zeros(env.n_slots), np.full(env.n_slots, np.nan)
-    lengths, backward = np.zeros(env.n_slots, dtype=np.int64), np.zeros(env.n_slots)
-    discount, time = 1.0, 0
-    trained = np.full(env.n_slots, np.iinfo(np.int64).max)  # behind every warm-up and schedule of exploration
+    alive = np.ones(n_slots, dtype=np.bool_)
+    returns, discounted, success = np.zeros(n_slots), np.zeros(n_slots), np.full(n_slots, np.nan)
+    lengths, backward = np.zeros(n_slots, dtype=np.int64), np.zeros(n_slots)
+    discount, time = np.ones(n_slots), 0
+    trained = np.full(n_slots, np.iinfo(np.int64).max)  # behind every warm-up and schedule of exploration
     while alive.any():
-        outputs = policy.outputs(observations)
-        chosen = policy.head.best(outputs) if noise is None else policy.head.sampled(outputs, noise, time, trained)
-        step = env.step(policy.head.executed(chosen))
+        outputs = acting.outputs(observations)
+        chosen = acting.head.best(outputs) if noise is None else acting.head.sampled(outputs, noise, time, trained)
+        step = env.step(acting.head.executed(chosen))
         backward = np.where(alive, gamma * backward + step.rewards, backward)
         time += 1
         if time == env.horizon and (alive & ~(step.terminated | step.truncated)).any():
@@ -356,7 +444,11 @@ def evaluate(
         put(observations, slice(None), step.observations)
         if len(ended) and alive.any():  # every slot must be steppable; what follows in these is not counted
             put(observations, ended, env.reset(ended, contexts[ended], seeds[ended]))
-    return Outcomes(policy.version, returns, discounted, lengths, success, backward)
+    return [
+        Outcomes(trial.policy.version, returns[mine], discounted[mine], lengths[mine], success[mine], backward[mine])
+        for index, trial in enumerate(trials)
+        for mine in [slice(index * count, (index + 1) * count)]
+    ]
 
 
 def start_observations(setup: Setup, chunk: int) -> Observations:
@@ -377,22 +469,27 @@ def joined(parts: list[Outcomes]) -> Outcomes:
 
 
 class _EpisodeTable:
-    """Sums up the episodes that run in the slots of one shard."""
+    """Sums up the episodes that run in `len(gamma)` slots, each with its own discount."""
 
-    def __init__(self, n_slots: int, gamma: float) -> None:
+    def __init__(self, gamma: FloatArray) -> None:
+        n_slots = len(gamma)
         self._gamma = gamma
-        self._rows: list[list[float]] = []  # id, slot, start, length, return, discounted return, success, end
-        self._row_of = np.full(n_slots, -1)
+        self._count = 0
+        self._begun: list[tuple[IntArray, IntArray, IntArray]] = []  # ids, slots, starts
+        self._ended: list[tuple[Any, ...]] = []  # numbers, lengths, returns, discounted returns, success, ends
+        self._row_of, self._start_of = np.full(n_slots, -1), np.zeros(n_slots, dtype=np.int64)
         self._returns, self._discounted, self._discount = np.zeros(n_slots), np.zeros(n_slots), np.ones(n_slots)
         self._success = np.full(n_slots, np.nan)
         self._time = 0
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self._count
 
     def begin(self, slots: IntArray, ids: IntArray, time: int) -> None:
-        self._row_of[slots] = len(self._rows) + np.arange(len(slots))
-        self._rows += [[instance, slot, time] for instance, slot in zip(ids.tolist(), slots.tolist(), strict=True)]
+        self._row_of[slots] = self._count + np.arange(len(slots))
+        self._start_of[slots] = time
+        self._count += len(slots)
+        self._begun.append((ids, slots, np.full(len(slots), time)))
         self._returns[slots], self._discounted[slots], self._discount[slots] = 0.0, 0.0, 1.0
 
     def add(self, rewards: FloatArray, success: NDArray[np.bool_] | None) -> None:
@@ -404,23 +501,28 @@ class _EpisodeTable:
         self._time += 1
 
     def end(self, slots: IntArray, ends: IntArray) -> None:
-        for slot, end in zip(slots.tolist(), ends.tolist(), strict=True):
-            row = self._rows[self._row_of[slot]]
-            row += [self._time - row[2], self._returns[slot], self._discounted[slot], self._success[slot], end]
-            self._row_of[slot] = -1
+        self._ended.append(
+            (self._row_of[slots], self._time - self._start_of[slots], self._returns[slots], self._discounted[slots],
+             self._success[slots], ends)
+        )  # fmt: skip
+        self._row_of[slots] = -1
 
     def running(self) -> IntArray:
         return np.flatnonzero(self._row_of >= 0)
 
-    def episodes(self) -> Episodes:
-        ids, slots, starts, lengths, returns, discounted, success, ends = zip(*self._rows, strict=True)
-        return Episodes(
-            ids=np.array(ids, dtype=np.int64),
-            slots=np.array(slots, dtype=np.int64),
-            starts=np.array(starts, dtype=np.int64),
-            lengths=np.array(lengths, dtype=np.int64),
-            returns=np.array(returns),
-            discounted_returns=np.array(discounted),
-            success=np.array(success),
-            ends=np.array(ends, dtype=np.int64),
-        )
+    def episodes(self, owners: int) -> list[Episodes]:
+        """Every owner's own, where owners have equally many slots, one after another."""
+        slots_each = len(self._gamma) // owners
+        ids, slots, starts = (np.concatenate(column) for column in zip(*self._begun, strict=True))
+        rows, *sums = (np.concatenate(column) for column in zip(*self._ended, strict=True))
+        order = np.argsort(rows)
+        lengths, returns, discounted, success, ends = (column[order] for column in sums)
+        owner = slots // slots_each
+        return [
+            Episodes(
+                ids=ids[mine], slots=slots[mine] % slots_each, starts=starts[mine], lengths=lengths[mine],
+                returns=returns[mine], discounted_returns=discounted[mine], success=success[mine], ends=ends[mine],
+            )
+            for index in range(owners)
+            for mine in [owner == index]
+        ]  # fmt: skip

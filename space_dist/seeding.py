@@ -82,6 +82,12 @@ def instance_keys(seed: int, purpose: Purpose, ids: NDArray[np.int64], contexts:
     return keys
 
 
+def global_seeds(seed: int, purpose: Purpose, *keys: int) -> tuple[int, int, int]:
+    """What Python's, NumPy's and torch's global generators are seeded with for code that insists on them."""
+    python, numpy, torch = seed_sequence(seed, purpose, *keys).generate_state(3, np.uint32).tolist()
+    return python, numpy, torch
+
+
 @contextmanager
 def global_generators(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
     """Seed Python's and NumPy's *global* generators for code that insists on them; restored afterwards.
@@ -89,10 +95,10 @@ def global_generators(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]
     SB3's buffers draw their minibatches from NumPy's global generator. torch's is seeded by `learner`, the one
     module that imports torch.
     """
-    state = seed_sequence(seed, purpose, *keys).generate_state(2, np.uint32)
+    for_python, for_numpy, _ = global_seeds(seed, purpose, *keys)
     python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
-    random.seed(int(state[0]))
-    np.random.seed(int(state[1]))  # noqa: NPY002
+    random.seed(for_python)
+    np.random.seed(for_numpy)  # noqa: NPY002
     try:
         yield
     finally:

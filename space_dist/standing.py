@@ -227,6 +227,13 @@ def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
     return Standing(run, ledger, condition, steps, budget, history.begun, last.cause, last.detail)
 
 
+def is_done(ledger: Ledger) -> bool:
+    """Whether a run has ended well."""
+    with contextlib.suppress(LedgerError):
+        return ledger.status_file.exists() and ledger.status().state == "done"
+    return False
+
+
 def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:
     """Whether a run that ended so may be tried again. `ends` counts the ends by cause, this one included if known."""
     if cause is Cause.STOPPED:

@@ -1,8 +1,9 @@
 """One attempt of one run, in a process of its own that is watched: memory, time, stops, and why it ended.
 
-Every place that runs grids (this machine, Ray pool, Ray job, SLURM task) does it through `Supervisor.attempt`. The run
-is a fork of the supervisor, which has imported everything already: it starts in milliseconds, and whatever it does to
-its process (leaks, crashes, global state) ends with it.
+Every place that runs grids (this machine, Ray pool, Ray job, SLURM task) does it through `Supervisor.attempt`. Runs
+with `engine: population` may share a process; each still has an attempt, and an end, of its own. The process is a fork
+of the supervisor, which has imported everything already: it starts in milliseconds, and whatever it does to itself
+(leaks, crashes, global state) ends with it.
 
 `python -m space_dist.supervisor` is a warm supervisor for many runs: a task a line on standard input, the end of each
 a line on standard output. When its input ends, so does it, after its run has made a checkpoint.
@@ -26,7 +27,7 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,16 +46,38 @@ _SIGN_SECONDS = 5.0
 _KILL_SECONDS = 10.0  # after a run's grace time
 _LISTEN_SECONDS = 2.0
 _PDEATHSIG = 1  # prctl's
+_MOST_WORDS = 4000  # of an error
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One run's attempt."""
+
+    cell: str
+    seed: int
+    attempt: int
+
+    def __str__(self) -> str:
+        return f"{self.cell}:{self.seed}:{self.attempt}"
+
+    @classmethod
+    def parse(cls, text: str) -> Turn:
+        """The inverse of `str`. Raises ConfigError for anything else."""
+        cell, *numbers = text.split(":")
+        if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+            raise ConfigError(f"{text!r}: write CELL:SEED:ATTEMPT")
+        return cls(cell, *map(int, numbers))
 
 
 @dataclass(frozen=True)
 class Task:
-    """What to attempt. grid: its folder. address: of the Ray to join. where: more about this place (a job's id)."""
+    """What to attempt, side by side where it is more than one. grid: its folder. address: of the Ray to join.
+
+    where: more about this place (a job's id).
+    """
 
     grid: str
-    cell: str
-    seed: int
-    attempt: int
+    turns: tuple[Turn, ...]
     address: str = "local"
     where: Mapping[str, Any] = field(default_factory=dict)
 
@@ -70,38 +93,56 @@ class Supervisor:
     def __init__(self) -> None:
         self._manifests: dict[str, tuple[int, Manifest]] = {}
 
-    def attempt(self, task: Task, stop_requested: Callable[[], Cause | None]) -> Ended:
-        """Run `task` until it has ended, and record it. `stop_requested` is asked all the time.
+    def attempt(self, task: Task, stop_requested: Callable[[], Cause | None]) -> list[Ended]:
+        """Make the attempts of `task` and record them; returns how each ended, in order. Asks `stop_requested` often.
 
         Raises LedgerError if the grid's folder cannot be read or written.
         """
         grid = Grid(task.grid)
         manifest = self._manifest(grid)
-        run = manifest.run(task.cell, task.seed)
-        ledger = grid.ledger(run)
-        if ledger.owner_alive():
-            return Busy(None, "another process is working on it")
-        attempts = Attempts(ledger)
-        attempts.begin(task.attempt, {**slurm_job(), **task.where})
+        runs = [manifest.run(turn.cell, turn.seed) for turn in task.turns]
+        begun = {run.key: turn for run, turn in zip(runs, task.turns, strict=True)
+                 if not grid.ledger(run).owner_alive()}  # fmt: skip
+        mine = [run for run in runs if run.key in begun]
+        for run in mine:
+            Attempts(grid.ledger(run)).begin(begun[run.key].attempt, {**slurm_job(), **task.where})
+        found = self._attempted(grid, manifest, mine, task.address, stop_requested) if mine else {}
+        for run in mine:
+            ended = found[run.key]
+            if isinstance(ended, Busy):
+                ended = Ended(Cause.STOPPED, "another process is working on it")
+            Attempts(grid.ledger(run)).end(begun[run.key].attempt, ended)
+        return [found.get(run.key, Busy(None, "another process is working on it")) for run in runs]
+
+    def _attempted(
+        self, grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str,
+        stop_requested: Callable[[], Cause | None],
+    ) -> dict[str, Ended]:  # fmt: skip
+        """How each of the runs ended, by its key, that one process worked on."""
         out_of_memory_before = _system_kills()
-        child = _Child.fork(lambda: _work(grid, manifest, run, task.address), ledger.folder / OUTPUT)
-        watch = _Watch(child, manifest.resources, attempts)
+        output = grid.ledger(runs[0]).folder / OUTPUT
+        child = _Child.fork(lambda tell: _work(grid, manifest, runs, address, tell), output)
+        watch = _Watch(child, manifest.resources, [Attempts(grid.ledger(run)) for run in runs])
         while (code := child.code()) is None:
             watch.look(stop_requested)
             time.sleep(_LOOK_SECONDS)
         child.clean()
-        if child.report().get("error") == RunLockedError.__name__:
-            attempts.end(task.attempt, Ended(Cause.STOPPED, "another process is working on it"))
-            return Busy(None, child.report().get("message", ""))
-        ended = Ended(None)
-        if code:
-            lost = watch.reason or _lost_with_ray(code, child, manifest, task.address)
-            ended = lost or _why(code, child, grid, _system_kills() > out_of_memory_before)
-        if ended.cause in (Cause.CRASH, Cause.CONFIG_ERROR):
-            lines = last_lines(ledger.folder / OUTPUT)
-            ended = Ended(ended.cause, "\n".join([*filter(None, [ended.detail]), *lines][-6:]))
-        attempts.end(task.attempt, ended)
-        return ended
+        system_killed = _system_kills() > out_of_memory_before
+        found: dict[str, Ended] = {}
+        for run in runs:
+            said = child.said.get(run.key)
+            if said is not None and said["code"] == 0:
+                found[run.key] = Ended(None)
+            elif said is not None and said["error"] == RunLockedError.__name__:
+                found[run.key] = Busy(None, said["message"])
+            else:
+                own = said is not None and said["code"] != Interrupted.exit_code
+                lost = None if own else watch.reason or _lost_with_ray(code, said, manifest, address)
+                found[run.key] = lost or _why(said["code"] if said else code, said or {}, grid, system_killed)
+            if found[run.key].cause in (Cause.CRASH, Cause.CONFIG_ERROR):
+                lines = [*filter(None, [found[run.key].detail]), *last_lines(output)]
+                found[run.key] = Ended(found[run.key].cause, "\n".join(lines[-6:]))
+        return found
 
     def _manifest(self, grid: Grid) -> Manifest:
         """Read once, as long as it does not change: manifests may be large, and runs short."""
@@ -116,16 +157,21 @@ class Supervisor:
 
 
 class _Child:
-    """A forked process, its last words through a pipe, and everything below it."""
+    """A forked process, what it says through a pipe, and everything below it.
+
+    said: how each of its runs ended, by its key, as far as it has said so.
+    """
 
     def __init__(self, pid: int, pipe: int) -> None:
         self.pid, self._pipe = pid, pipe
+        os.set_blocking(pipe, False)
+        self.said: dict[str, dict[str, Any]] = {}
         self._process = psutil.Process(pid)
         self._code: int | None = None
         self._words = b""
 
     @classmethod
-    def fork(cls, work: Callable[[], None], output: Path) -> _Child:
+    def fork(cls, work: Callable[[Tell], None], output: Path) -> _Child:
         sys.stdout.flush()
         sys.stderr.flush()
         parent = os.getpid()
@@ -142,10 +188,8 @@ class _Child:
             if os.getppid() != parent:
                 os._exit(Interrupted.exit_code)
             code = _child_main(work, output, writing)
-        except BaseException as error:  # nothing may return into the parent's code
+        except BaseException:  # nothing may return into the parent's code
             traceback.print_exc()
-            with contextlib.suppress(OSError):
-                os.write(writing, json.dumps({"error": type(error).__name__}).encode())
         finally:
             with contextlib.suppress(Exception):
                 sys.stdout.flush()
@@ -154,6 +198,7 @@ class _Child:
 
     def code(self) -> int | None:
         """The exit code, minus the number of the signal that ended it; None while it lives."""
+        self._listen()
         if self._code is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             if pid:
@@ -180,17 +225,19 @@ class _Child:
         """Kill what the run has left in its session, and hear its last words."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
-        with contextlib.suppress(OSError):
+        self._listen()
+        os.close(self._pipe)
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError):  # nothing more for now
             while chunk := os.read(self._pipe, 1 << 16):
                 self._words += chunk
-            os.close(self._pipe)
-
-    def report(self) -> dict[str, str]:
-        """What it said of its error, if anything."""
-        with contextlib.suppress(ValueError):
-            found = json.loads(self._words)
-            return found if isinstance(found, dict) else {}
-        return {}
+        *lines, self._words = self._words.split(b"\n")
+        for line in lines:
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                found = json.loads(line)
+                self.said[found["run"]] = {"code": int(found["code"]), "error": str(found["error"]),
+                                           "message": str(found["message"])}  # fmt: skip
 
 
 @dataclass
@@ -199,7 +246,7 @@ class _Watch:
 
     child: _Child
     resources: RunResources
-    attempts: Attempts
+    attempts: Sequence[Attempts]  # that share its process, and so the sum of what each may use
     reason: Ended | None = None
     began: float = field(default_factory=time.monotonic)
     kill_at: float | None = None
@@ -210,11 +257,13 @@ class _Watch:
         now = time.monotonic()
         if now - self.last_sign > _SIGN_SECONDS:
             self.last_sign = now
-            self.attempts.sign()
+            for attempts in self.attempts:
+                attempts.sign()
         used, state = self._used()
-        limit = self.resources.memory_mb
-        if limit is not None and used > limit << 20:
-            self._end(Ended(Cause.OUT_OF_MEMORY, f"its processes used {used >> 20} MB; memory_mb is {limit}"))
+        limit, members = self.resources.memory_mb, len(self.attempts)
+        if limit is not None and used > members * limit << 20:
+            allowed = f"memory_mb is {limit}" + (f", for each of {members} runs" if members > 1 else "")
+            self._end(Ended(Cause.OUT_OF_MEMORY, f"its processes used {used >> 20} MB; {allowed}"))
         self.stopped_since = (self.stopped_since or now) if state == psutil.STATUS_STOPPED else None
         if self.stopped_since is not None and now - self.stopped_since > STOPPED_SECONDS:
             self._end(Ended(Cause.KILLED, f"it was stopped by a signal (SIGSTOP) for {STOPPED_SECONDS:.0f} s"))
@@ -222,8 +271,9 @@ class _Watch:
             minutes, asked = self.resources.minutes, stop_requested()
             if asked is not None:
                 self._ask(Ended(asked))
-            elif minutes is not None and now - self.began > 60.0 * minutes:
-                self._ask(Ended(Cause.TIMEOUT, f"it took longer than {minutes:g} minutes"))
+            elif minutes is not None and now - self.began > 60.0 * minutes * members:
+                allowed = f"{minutes:g} minutes" + (f" for each of {members} runs" if members > 1 else "")
+                self._ask(Ended(Cause.TIMEOUT, f"it took longer than {allowed}"))
         elif now > self.kill_at:
             self.child.kill()
 
@@ -246,9 +296,9 @@ class _Watch:
         self.child.kill()
 
 
-def _lost_with_ray(code: int, child: _Child, manifest: Manifest, address: str) -> Ended | None:
+def _lost_with_ray(code: int, said: Mapping[str, Any] | None, manifest: Manifest, address: str) -> Ended | None:
     """Ray ends a process at once, and without a word to it, when the Ray of its node is gone."""
-    silent = code == 1 and not child.report()
+    silent = code == 1 and not said
     if manifest.resources.workers and (silent or (code == -signal.SIGABRT and not ray_answers(address))):
         return Ended(Cause.NODE_LOST, "Ray on its node is gone, and the run with it")
     return None
@@ -266,9 +316,8 @@ def ray_answers(address: str) -> bool:
     return True
 
 
-def _why(code: int, child: _Child, grid: Grid, system_killed: bool) -> Ended:
-    """Why a child ended that nobody here ended."""
-    said = child.report()
+def _why(code: int, said: Mapping[str, Any], grid: Grid, system_killed: bool) -> Ended:
+    """Why a run ended that nobody here ended: by its own exit code, or its process's if it has said nothing."""
     message = said.get("message", "")
     if code == Interrupted.exit_code:
         return Ended(Cause.STOPPED if grid.stop_file.exists() else Cause.PREEMPTED, message)
@@ -280,7 +329,7 @@ def _why(code: int, child: _Child, grid: Grid, system_killed: bool) -> Ended:
         return Ended(Cause.KILLED, "SIGKILL")
     if code < 0:
         return Ended(Cause.CRASH, f"ended by {signal.Signals(-code).name}")
-    return Ended(Cause.CRASH, message or f"exit code {code}")
+    return Ended(Cause.CRASH, message or (f"exit code {code}" if code else "its process ended without a word"))
 
 
 def _system_kills() -> int:
@@ -299,29 +348,58 @@ def _system_kills() -> int:
 # ---- in the child ---------------------------------------------------------------------------------------------------
 
 
-def _child_main(work: Callable[[], None], output: Path, pipe: int) -> int:
-    """The exit code; an error's sentence goes to the output and through the pipe."""
+Tell = Callable[[Run, "SpaceDistError | None"], None]
+"""What a process says of a run that has ended: its error, None where it is done."""
+
+
+def _child_main(work: Callable[[Tell], None], output: Path, pipe: int) -> int:
+    """The exit code: of its run's error; 0 if it has more, each of which has an end of its own."""
     descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
-    try:
-        work()
-    except SpaceDistError as error:
-        print(f"space-dist: {error}", file=sys.stderr)
-        kind = MemoryError if isinstance(error.__cause__, MemoryError) else type(error)
-        os.write(pipe, json.dumps({"error": kind.__name__, "message": str(error)[:4000]}).encode())
-        return error.exit_code
-    return 0
+    codes: list[int] = []
+
+    def tell(run: Run, error: SpaceDistError | None) -> None:
+        kind, message = "", ""
+        if error is not None:
+            print(f"space-dist: {error}", file=sys.stderr)
+            kind = (MemoryError if isinstance(error.__cause__, MemoryError) else type(error)).__name__
+            message = str(error)[:_MOST_WORDS]
+        codes.append(0 if error is None else error.exit_code)
+        said = {"run": run.key, "code": codes[-1], "error": kind, "message": message}
+        os.write(pipe, json.dumps(said).encode() + b"\n")
+
+    work(tell)
+    return codes[0] if len(codes) == 1 else 0
 
 
-def _work(grid: Grid, manifest: Manifest, run: Run, address: str) -> None:
-    from space_dist.launch import launch
+def _work(grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str, tell: Tell) -> None:
+    from space_dist.launch import Outcome, launch
 
     stop = StopRequests()
     stop.install()
-    launch(grid.run_config(manifest, run, address=address), grid.ledger(run).folder, resume=True, stop=stop)
+    if len(runs) == 1:
+        config, folder, failed = grid.run_config(manifest, runs[0], address=address), grid.ledger(runs[0]).folder, None
+        try:
+            launch(config, folder, resume=True, stop=stop)
+        except SpaceDistError as error:
+            failed = error
+        tell(runs[0], failed)
+        return
+    from space_dist.population import advance, member
+
+    by_folder = {grid.ledger(run).folder: run for run in runs}
+
+    def ended(folder: Path, outcome: Outcome | SpaceDistError) -> None:
+        tell(by_folder[folder], outcome if isinstance(outcome, SpaceDistError) else None)
+
+    advance(
+        {folder: member(grid.run_config(manifest, run, address=address), folder, stop=stop)
+         for folder, run in by_folder.items()},
+        ended,
+    )  # fmt: skip
 
 
 # ---- as a process of its own ----------------------------------------------------------------------------------------
@@ -340,7 +418,8 @@ class _Manager:
             message = self._next(None)
             if message is not None and "stop" not in message:
                 self._asked = None
-                yield Task(**message)
+                turns = tuple(Turn(**turn) for turn in message.pop("turns"))
+                yield Task(turns=turns, **message)
 
     def stop_requested(self) -> Cause | None:
         message = self._next(0.0)
@@ -376,13 +455,15 @@ def main() -> None:
         try:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
-            ended = Ended(Cause.CONFIG_ERROR if isinstance(error, ConfigError) else Cause.CRASH, str(error))
-        print(json.dumps({"busy": isinstance(ended, Busy), **dataclasses.asdict(ended)}), file=results, flush=True)
+            cause = Cause.CONFIG_ERROR if isinstance(error, ConfigError) else Cause.CRASH
+            ended = [Ended(cause, str(error)) for _ in task.turns]
+        told = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
+        print(json.dumps({"ends": told}), file=results, flush=True)
 
 
 def preload() -> None:
     """Import what every run needs, so that forks need not. Starts no thread."""
-    import space_dist.launch  # noqa: F401
+    import space_dist.population  # noqa: F401
     from space_dist import learner
 
     learner.preload()

@@ -9,7 +9,11 @@
         select   cluster.decide(state, evidence)         the next selection, from that and what else was asked for
     now and then: evaluate on all instances, and commit to the ledger
 
-The driver waits once per round, for the shards. What is asked for at the end of a round (decision, evaluation) is
+`Training.work` is a generator: it yields what it waits for, values (`Wait`) or an update (`Learn`), and is sent the
+answer. `Training.run` answers for one run; a population answers for many, whose shards are then collected, and whose
+updates are made, together.
+
+A run waits once per round, for the shards. What is asked for at the end of a round (decision, evaluation) is
 picked up at the next wait, or before a commit: `_settle`. Only where a curriculum probes instances does it wait for
 those episodes as well: how many steps they took decides whether the budget has room for another round. A run is a pure
 function of (config, seed).
@@ -19,12 +23,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +41,19 @@ from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
-from space_dist.learner import Arrays, Ensemble, Learner, Update, make_ensemble, make_learner, refuse_spaces
+from space_dist.learner import (
+    Arrays,
+    Ensemble,
+    Learner,
+    Update,
+    make_ensemble,
+    make_learner,
+    refuse_population,
+    refuse_spaces,
+    stack_key,
+)
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
-from space_dist.policy import MlpPolicy, Policy, blind, to_arrays
+from space_dist.policy import MlpPolicy, Policy, Statistics, blind, to_arrays
 from space_dist.rollout import (
     CUT,
     Outcomes,
@@ -90,6 +105,8 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         )
     env = make_env(config)
     refuse_spaces(config.learner, env.observation_space, env.action_space)
+    if config.engine == "population":
+        refuse_population(config.learner, env.observation_space, env.action_space)
     if config.curriculum.ranks_by_start_value and _starts_alike(config, train):
         raise ConfigError(
             f"curriculum.kind: {config.curriculum.kind} ranks instances by the value of their start, but all instances "
@@ -175,6 +192,7 @@ class _Run:
     rounds_left: int | None = None  # in this iteration; None until the selection is known
     version: int = 0  # of the selection being trained on
     walk: Walk = field(default_factory=lambda: Walk(-1, ()))
+    came_from: Walk = field(default_factory=lambda: Walk(-1, ()))  # the walk of the round that is learned from
     rows: int = 0
     evaluated_at: int = -1  # steps
     rollouts: list[dict[str, float]] = field(default_factory=list)  # of this iteration's rounds
@@ -184,6 +202,8 @@ class _Run:
     segments: list[Segment] = field(default_factory=list)  # of the replay buffer, as of the last commit
     trained: Selection | None = None  # the selection being trained on, once known
     seen: list[Episodes] = field(default_factory=list)  # of this iteration's rounds, where anyone asks for them
+    ahead: list[Handle] = field(default_factory=list)  # shards of the next round, if they were asked for already
+    acted: Arrays | None = None  # the weights that collect these
     # Handles, and what they wait for
     state: Handle = None
     selection: Handle = None
@@ -199,8 +219,30 @@ class _Pending:
     settle: Callable[[list[Any]], None]
 
 
+@dataclass(frozen=True)
+class Wait:
+    """A run needs the values of `handles`, as a list, to go on."""
+
+    handles: list[Handle]
+
+
+@dataclass(frozen=True)
+class Learn:
+    """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
+
+    learner: Learner
+    shards: list[Shard]
+    round: int
+    steps: int
+    acted: Arrays | None = None
+
+
+T = TypeVar("T")
+Work = Generator[Wait | Learn, Any, T]
+
+
 class Training:
-    """One run in progress. `run` is Algorithm 1; the rest keeps its books."""
+    """One run in progress. `work` is Algorithm 1; the rest keeps its books."""
 
     def __init__(
         self,
@@ -228,23 +270,40 @@ class Training:
 
     def run(self) -> None:
         """Train to the end of the budget. Raises Interrupted, after a commit, if asked to stop."""
+        work = self.work()
+        answer: Any = None
+        while True:
+            try:
+                request = work.send(answer)
+            except StopIteration:
+                return
+            if isinstance(request, Wait):
+                answer = self._cluster.get(request.handles)
+            else:
+                answer = self.learner.update(
+                    request.shards, round=request.round, steps=request.steps, acted=request.acted
+                )
+
+    def work(self) -> Work[None]:
+        """What `run` does, as a generator: whoever advances it answers `Wait` and `Learn`."""
         run, cluster, config = self._run, self._cluster, self._config
         checkpoint = self._writer.restore()
-        policy = self._restore(checkpoint) if checkpoint else self._begin()
+        policy = self._restore(checkpoint) if checkpoint else (yield from self._begin())
         while not self._is_over():
-            shards: list[Shard] = self._wait_for(
-                cluster.collect(policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version)
-            )
-            steps = run.steps + sum(shard.steps for shard in shards)
-            self._account(shards, self._update(shards, steps))
+            shards: list[Shard] = yield from self._settle(run.ahead or self._collect(policy, lag=0))
+            run.ahead, acted, scales = [], run.acted, self.learner.statistics  # of the weights that acted
+            self._arrived(shards, lag=0 if acted is None else 1)
+            run.acted = self._look_ahead(policy)
+            update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted)
+            self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
-                self._decide(policy)
+                yield from self._decide(policy)
             if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
                 self._evaluate(policy)
             self._show()
-            self._commit_if_due()
-        self._finish()
+            yield from self._commit_if_due()
+        yield from self._finish()
 
     def _is_over(self, reserved: int = 0) -> bool:
         """Whether another round, and `reserved` steps before it, would exceed the budget."""
@@ -254,16 +313,16 @@ class Training:
 
     # ---- the parts of an iteration ----
 
-    def _begin(self) -> Handle:
+    def _begin(self) -> Work[Handle]:
         cluster = self._cluster
         if self.learner.normalises:
-            self._probe()
+            yield from self._probe()
         policy = cluster.put(self.learner.policy(0))
         self._adopt(cluster.begin(cluster.start_values(policy)))
         self._evaluate(policy)
         return policy
 
-    def _probe(self) -> None:
+    def _probe(self) -> Work[None]:
         """One round of actions that ignore the observation gives the first scales; its steps count like any others."""
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
@@ -272,23 +331,21 @@ class Training:
         handles = cluster.collect(
             cluster.put(policy), cluster.put(selection), run.walk, round=PROBE, steps=0, version=selection.version
         )  # fmt: skip
-        shards: list[Shard] = cluster.get(handles)
+        shards: list[Shard] = yield Wait(handles)
         self.learner.observe(shards)
         run.steps += sum(shard.steps for shard in shards)
 
-    def _update(self, shards: list[Shard], steps: int) -> Update:
-        """Learn from a round; `steps`: of the run, with these shards."""
-        scales = self.learner.statistics  # the ones that the round was collected under
-        update = self.learner.update(shards, round=self._run.round, steps=steps)
+    def _with_ensemble(self, update: Update, shards: list[Shard], scales: Statistics) -> Update:
+        """The update, and what the ensemble, if there is one, learned from the same shards."""
         if self.ensemble is None:
             return update
         metrics = self.ensemble.update(shards, scales, round=self._run.round)
         return dataclasses.replace(update, metrics={**update.metrics, **metrics})
 
-    def _decide(self, policy: Handle) -> None:
+    def _decide(self, policy: Handle) -> Work[None]:
         """Gather what the curriculum asks for and let it choose; the answer is picked up at the next wait."""
         run, cluster = self._run, self._cluster
-        probes = self._probe_instances(policy)
+        probes = yield from self._probe_instances(policy)
         decision = cluster.decide(
             run.state, run.values, self._evidence(policy, probes),
             version=run.version, gradient_steps=run.gradient_steps,
@@ -306,7 +363,7 @@ class Training:
         run.version += 1
         run.rollouts, run.updates, run.seen, run.gradient_steps = [], [], [], 0
 
-    def _probe_instances(self, policy: Handle) -> list[Outcomes]:
+    def _probe_instances(self, policy: Handle) -> Work[list[Outcomes]]:
         """Run the probe episodes that the curriculum asks for, if any, and charge their steps to the budget.
 
         There are none where they, at their longest, would leave no room for another round.
@@ -315,7 +372,7 @@ class Training:
         indices = self._curriculum.probes(run.version)
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
-        outcomes: list[Outcomes] = self._settle(cluster.probe(policy, indices, version=run.version))
+        outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))
         run.steps += sum(int(part.lengths.sum()) for part in outcomes)
         return outcomes
 
@@ -383,42 +440,70 @@ class Training:
         run.pending.append(_Pending(handles, settle))
         run.evaluated_at = run.steps
 
-    def _account(self, shards: list[Shard], update: Update) -> None:
+    def _collect(self, policy: Handle, *, lag: int) -> list[Handle]:
+        """Ask for the next round."""
+        run = self._run
+        return self._cluster.collect(
+            policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version, lag=lag
+        )
+
+    def _arrived(self, shards: list[Shard], *, lag: int) -> None:
+        """Count a round's shards, and note where the next one goes on."""
         run = self._run
         for shard in shards:
-            if (shard.policy_version, shard.selection_version, shard.round) != (run.round, run.version, run.round):
+            if (shard.policy_version, shard.selection_version, shard.round) != (
+                run.round - lag,
+                run.version,
+                run.round,
+            ):
                 raise RuntimeError(f"shard {shard.shard} of round {run.round} answers another question")
-        order, n_shards = shards[0].order_version, len(shards)
         selection = run.trained
         if selection is None or run.rounds_left is None:
             raise RuntimeError("a round ended before its selection was known")
-        if self._curriculum.wants.episodes:
-            places = [run.walk.places(selection, shard.shard, n_shards, len(shard.episodes)) for shard in shards]
-            run.seen.append(
-                _episodes(self._setup.train, selection, np.concatenate(places), shards, update.advantages)
-            )  # fmt: skip
+        run.came_from, n_shards = run.walk, len(shards)
         run.walk = Walk(
-            order,
+            shards[0].order_version,
             tuple(
                 (run.walk.position(selection, shard.shard, n_shards) + len(shard.episodes)) % len(selection.ids)
                 for shard in shards
             ),
         )
-        run.rollouts.append(_rollout_sums(shards))
-        run.updates.append(update.metrics)
-        run.gradient_steps += update.gradient_steps
         run.round += 1
         run.rounds_left -= 1
         run.steps += sum(shard.steps for shard in shards)
         run.episodes += sum(len(shard.episodes) for shard in shards)
 
-    def _finish(self) -> None:
+    def _look_ahead(self, policy: Handle) -> Arrays | None:
+        """With `rollout.overlap`, ask for the next round before the update on this one; returns the weights that act.
+
+        Not at the end of an iteration: the next selection is not known yet.
+        """
+        if not self._config.rollout.overlap or self._run.rounds_left == 0 or self._is_over():
+            return None
+        self._run.ahead = self._collect(policy, lag=1)
+        return self.learner.scored()
+
+    def _account(self, shards: list[Shard], update: Update) -> None:
+        """Note what a round's episodes and its update showed."""
+        run, selection = self._run, self._run.trained
+        if selection is not None and self._curriculum.wants.episodes:
+            places = [
+                run.came_from.places(selection, shard.shard, len(shards), len(shard.episodes)) for shard in shards
+            ]
+            run.seen.append(
+                _episodes(self._setup.train, selection, np.concatenate(places), shards, update.advantages)
+            )  # fmt: skip
+        run.rollouts.append(_rollout_sums(shards, lag=run.round - 1 - shards[0].policy_version))
+        run.updates.append(update.metrics)
+        run.gradient_steps += update.gradient_steps
+
+    def _finish(self) -> Work[None]:
         run = self._run
         if run.rollouts:  # the budget ended inside an iteration: its steps are told, its decision never falls
-            self._settle()
+            yield from self._settle()
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
             run.rollouts, run.updates, run.seen = [], [], []
-        self._commit("done")
+        yield from self._commit("done")
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
         self._writer.write_model(arrays, {**description, "context_visible": self._config.env.context_visible})
@@ -426,13 +511,10 @@ class Training:
 
     # ---- waiting, and the ledger ----
 
-    def _wait_for(self, handles: Sequence[Handle]) -> list[Any]:
-        """The one wait of a round: the shards, and whatever was asked for since the last one."""
-        return self._settle(handles)
-
-    def _settle(self, handles: Sequence[Handle] = ()) -> list[Any]:
+    def _settle(self, handles: Sequence[Handle] = ()) -> Work[list[Any]]:
+        """Wait for the values of `handles`, and for whatever was asked for since the last wait."""
         pending, self._run.pending = self._run.pending, []
-        answers = self._cluster.get([*handles, *(handle for one in pending for handle in one.handles)])
+        answers: list[Any] = yield Wait([*handles, *(handle for one in pending for handle in one.handles)])
         at = len(handles)
         for one in pending:
             one.settle(answers[at : at + len(one.handles)])
@@ -460,6 +542,7 @@ class Training:
             "episodes": int(totals["episodes"]),
             "episodes_cut": int(totals["cut"]),
             "gradient_steps": run.gradient_steps,
+            **({"lagged_steps": int(totals["lagged"])} if self._config.rollout.overlap else {}),
             "rollout": {
                 name: totals[name] / finished if finished and math.isfinite(totals[name]) else None
                 for name in ("return", "discounted_return", "length", "success")
@@ -487,23 +570,23 @@ class Training:
         if rate is not None:
             self.progress.steps_per_second = rate
 
-    def _commit_if_due(self) -> None:
+    def _commit_if_due(self) -> Work[None]:
         reason = self._stop_requested()
         if reason is not None:
-            self._commit("interrupted", reason)
+            yield from self._commit("interrupted", reason)
             raise Interrupted(f"stopped by {reason} after {self._run.steps} steps; --resume continues")
         settings = self._config.checkpoint
         if (
             self._run.round - self._last_commit_round >= settings.every_rounds
             or time.monotonic() - self._last_commit_time >= settings.every_seconds
         ):
-            self._commit("running")
+            yield from self._commit("running")
 
-    def _commit(self, state: str, message: str | None = None) -> None:
-        self._settle()
+    def _commit(self, state: str, message: str | None = None) -> Work[None]:
+        yield from self._settle()
         # A run is done only once its model is written.
         status = self._new_status("running" if state == "done" else state, message)
-        self._writer.commit(self._save(), status)
+        self._writer.commit((yield from self._save()), status)
         self._last_commit_time, self._last_commit_round = time.monotonic(), self._run.round
 
     def _new_status(self, state: Any, message: str | None = None) -> Status:
@@ -512,15 +595,16 @@ class Training:
             updated_at=time.time(),
         )  # fmt: skip
 
-    def _save(self) -> Checkpoint:
+    def _save(self) -> Work[Checkpoint]:
         run = self._run
         arrays, learner = self.learner.save()
         arrays = {f"learner/{name}": array for name, array in arrays.items()}
-        state, values = self._cluster.get([run.state, run.values])
+        state, values = yield Wait([run.state, run.values])
         remembered, numbers = encode_state(state)
         arrays["values"] = values
         arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
         arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
+        arrays |= {f"acted/{name}": array for name, array in (run.acted or {}).items()}
         if run.seen:
             arrays |= {f"seen/{name}": array for name, array in vars(_joined_episodes(run.seen)).items()}
         if self.ensemble is not None:
@@ -578,6 +662,9 @@ class Training:
         if self.ensemble is not None:
             self.ensemble.load(_under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
+        if acted := _under("acted/", arrays):
+            run.acted = acted
+            run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
 
     def _show(self) -> None:
@@ -601,6 +688,27 @@ def total_steps(config: RunConfig, horizon: int) -> int:
     return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
 
 
+def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
+    """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
+    if config.engine != "auto":
+        return config
+    env, engine = make_env(config), "population" if can_share else "single"
+    try:
+        refuse_population(config.learner, env.observation_space, env.action_space)
+    except ConfigError:
+        engine = "single"
+    return config.model_copy(update={"engine": engine})
+
+
+def stack_of(config: RunConfig) -> str:
+    """`(16 hex digits)` equal for runs that may be members of one population; empty for those of no population."""
+    if config.engine != "population":
+        return ""
+    env = make_env(config)
+    key = (config.env.model_dump_json(), stack_key(config.learner, env.observation_space, env.action_space))
+    return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+
+
 def learner_of(config: RunConfig) -> Learner:
     """A config's learner with its initial networks."""
     env = make_env(config)
@@ -608,6 +716,7 @@ def learner_of(config: RunConfig) -> Learner:
         config.learner, env.observation_space, env.action_space,
         seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots,
         slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
+        population=config.engine == "population",
     )  # fmt: skip
 
 
@@ -678,9 +787,13 @@ def _joined_episodes(parts: Sequence[Episodes]) -> Episodes:
     return Episodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def _rollout_sums(shards: list[Shard]) -> dict[str, float]:
-    """Sums over a round's finished episodes (cut ones have no return), and how many there were."""
-    sums = dict.fromkeys(("episodes", "cut", "finished", "return", "discounted_return", "length", "success"), 0.0)
+def _rollout_sums(shards: list[Shard], *, lag: int) -> dict[str, float]:
+    """Sums over a round's finished episodes (cut ones have no return), and how many there were.
+
+    lag: updates that the acting weights were behind.
+    """
+    sums = {"lagged": float(lag * sum(shard.steps for shard in shards))}
+    sums |= dict.fromkeys(("episodes", "cut", "finished", "return", "discounted_return", "length", "success"), 0.0)
     for shard in shards:
         episodes = shard.episodes
         finished = episodes.ends != CUT

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -385,8 +386,18 @@ class Supervised:
         self.process.stdin.flush()
 
     def attempt(self, grid: Grid, run: Run, attempt: int = 1) -> dict[str, Any]:
-        self.send({"grid": str(grid.folder), "cell": run.cell.id, "seed": run.seed, "attempt": attempt})
-        return self.read()
+        (end,) = self.attempts(grid, [run], attempt)
+        return end
+
+    def attempts(self, grid: Grid, runs: list[Run], attempt: int = 1) -> list[dict[str, Any]]:
+        self.send(task(grid, runs, attempt))
+        ends: list[dict[str, Any]] = self.read()["ends"]
+        return ends
+
+
+def task(grid: Grid, runs: list[Run], attempt: int = 1) -> dict[str, Any]:
+    turns = [{"cell": run.cell.id, "seed": run.seed, "attempt": attempt} for run in runs]
+    return {"grid": str(grid.folder), "turns": turns}
 
 
 @pytest.fixture(scope="module")
@@ -457,9 +468,9 @@ def test_a_run_that_others_work_on_is_left_alone(supervised: Supervised, tmp_pat
 
 def test_a_stop_makes_a_checkpoint_and_the_run_goes_on(supervised: Supervised, tmp_path: Path) -> None:
     grid, manifest, run = faulty(tmp_path, "none")
-    supervised.send({"grid": str(grid.folder), "cell": run.cell.id, "seed": 0, "attempt": 1})
+    supervised.send(task(grid, [run]))
     supervised.send({"stop": "stopped"})
-    ended = supervised.read()
+    (ended,) = supervised.read()["ends"]
     assert ended["cause"] in ("stopped", None)  # None: it was done before it heard
     assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition in ("waiting", "done")
     assert supervised.attempt(grid, run, 2)["cause"] is None
@@ -468,7 +479,7 @@ def test_a_stop_makes_a_checkpoint_and_the_run_goes_on(supervised: Supervised, t
 def test_a_run_stops_when_its_supervisor_is_killed(tmp_path: Path) -> None:
     grid, manifest, run = faulty(tmp_path, "slow")
     lonely = Supervised()
-    lonely.send({"grid": str(grid.folder), "cell": run.cell.id, "seed": 0, "attempt": 1})
+    lonely.send(task(grid, [run]))
     deadline = time.monotonic() + 30
     while not grid.ledger(run).owner_alive() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -489,22 +500,25 @@ class Script:
 
     def __init__(self, grid: Grid, causes: dict[str, list[Cause | None]], size: int = 2) -> None:
         self.grid, self.causes, self.size = grid, causes, size
-        self.live: list[tuple[Run, int]] = []
+        self.live: list[Sequence[tuple[Run, int]]] = []
         self.started: list[str] = []
+        self.groups: list[list[str]] = []
         self.most = 0
 
     def room(self) -> int:
         return self.size - len(self.live)
 
-    def start(self, run: Run, attempt: int) -> None:
-        self.started.append(run.key)
-        self.live.append((run, attempt))
+    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+        self.groups.append([run.key for run, _ in turns])
+        self.live.append(turns)
         self.most = max(self.most, len(self.live))
-        Attempts(self.grid.ledger(run)).begin(attempt, {})
+        for run, attempt in turns:
+            self.started.append(run.key)
+            Attempts(self.grid.ledger(run)).begin(attempt, {})
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         ended: list[tuple[Run, Ended | None]] = []
-        for run, attempt in self.live:
+        for run, attempt in (turn for turns in self.live for turn in turns):
             causes = self.causes.get(run.key, [])
             how = Ended(causes.pop(0) if causes else None, "as told")
             Attempts(self.grid.ledger(run)).end(attempt, how)
@@ -582,8 +596,8 @@ def test_a_run_that_ray_took_with_it_is_lost_and_not_crashed(
             os._exit(1)
 
         monkeypatch.setattr(supervisor, "_work", work)
-        task = supervisor.Task(str(made.grid.folder), run.cell.id, run.seed, 1, address)
-        assert supervisor.Supervisor().attempt(task, lambda: None).cause is cause
+        asked = supervisor.Task(str(made.grid.folder), (supervisor.Turn(run.cell.id, run.seed, 1),), address)
+        assert [ended.cause for ended in supervisor.Supervisor().attempt(asked, lambda: None)] == [cause]
 
 
 def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
@@ -595,13 +609,16 @@ def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
     started: list[Run] = []
 
     class OneAtATime:
+        size = 1
+
         def __init__(self) -> None:
             self.now: Run | None = None
 
         def room(self) -> int:
             return self.now is None
 
-        def start(self, run: Run, attempt: int) -> None:
+        def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+            ((run, attempt),) = turns
             self.now = run
             started.append(run)
             Attempts(made.grid.ledger(run)).begin(attempt, {})
@@ -625,3 +642,92 @@ def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
 
     Conductor(made.grid, made.manifest, runs, OneAtATime(), stop_requested=lambda: None).conduct()
     assert started == [runs[2], runs[0], runs[0], runs[1], runs[3]]
+
+
+def test_runs_that_can_share_a_process_are_dealt_evenly_to_all_places(tmp_path: Path) -> None:
+    settings = {**SMALL, "engine": "population"}
+    made = plan(write_grid(tmp_path, set=settings, seeds=[0, 1, 2]), tmp_path / "runs")
+    script = Script(made.grid, {made.manifest.runs()[0].key: [Cause.KILLED]})
+    Conductor(made.grid, made.manifest, made.manifest.runs(), script, stop_requested=lambda: None).conduct()
+    assert [len(group) for group in script.groups] == [3, 3, 1]
+    assert script.groups[2] == [made.manifest.runs()[0].key]
+
+
+def test_only_what_is_alike_shares_a_process(tmp_path: Path) -> None:
+    shapes = {"learner.net_arch": [[8], [8, 8]], "curriculum.kappa": [1, 4]}
+    made = plan(write_grid(tmp_path, grid=shapes, set={**SMALL, "engine": "auto"}), tmp_path / "runs")
+    script = Script(made.grid, {}, size=1)
+    Conductor(made.grid, made.manifest, made.manifest.runs(), script, stop_requested=lambda: None).conduct()
+    assert [len(group) for group in script.groups] == [4, 4]
+    shape_of = {run.key: run.cell.settings["learner.net_arch"] for run in made.manifest.runs()}
+    assert all(len({str(shape_of[key]) for key in group}) == 1 for group in script.groups)
+
+
+@pytest.mark.parametrize(
+    ("changes", "workers", "engine"),
+    [({}, 0, "population"), ({}, 1, "single"), ({"learner": {"kind": "sac", "n_steps": 1024}}, 0, "single"),
+     ({"learner": {"kind": "a2c", "n_steps": 1024}}, 0, "single")],
+)  # fmt: skip
+def test_auto_is_decided_when_a_grid_is_frozen(
+    changes: dict[str, Any], workers: int, engine: str, tmp_path: Path
+) -> None:  # fmt: skip
+    settings = {**{key: value for key, value in SMALL.items() if not changes or "learner" not in key}, **changes}
+    path = write_grid(tmp_path, set={**settings, "engine": "auto"}, resources={"workers": workers})
+    cells = plan(path, tmp_path / "runs").manifest.cells
+    assert [cell.config["engine"] for cell in cells] == [engine] * 2
+    assert all(bool(cell.stack) == (engine == "population") for cell in cells)
+
+
+def test_members_of_a_population_have_no_actors(tmp_path: Path) -> None:
+    path = write_grid(tmp_path, set={**SMALL, "engine": "population"}, resources={"workers": 1})
+    with pytest.raises(ConfigError, match="workers: 0, or engine: single"):
+        plan(path, tmp_path / "runs")
+
+
+def test_members_of_a_population_end_each_for_itself(supervised: Supervised, tmp_path: Path) -> None:
+    """In one process: one diverges, one is worked on by somebody else, one is not its config; two are done."""
+    made = plan(
+        write_grid(
+            tmp_path, seeds=[0], set={**SMALL, "engine": "population"},
+            grid={"learner.learning_rate": [1e-3, 1e30, 2e-3, 3e-3]},
+        ),
+        tmp_path / "runs",
+    )  # fmt: skip
+    grid, runs = made.grid, made.manifest.runs()
+    grid.ledger(runs[2]).folder.mkdir(parents=True)
+    lock = Lock(grid.ledger(runs[2]).lock_file)
+    lock.acquire()
+    try:
+        ends = supervised.attempts(grid, runs)
+    finally:
+        lock.release()
+    assert [(end["cause"], end["busy"]) for end in ends] == [
+        (None, False), ("crash", False), (None, True), (None, False)
+    ]  # fmt: skip
+    assert "diverged" in ends[1]["detail"]
+    found = [standing_of(run, grid.ledger(run), made.manifest.retry, CODE).condition for run in runs]
+    assert found == ["done", "failed", "waiting", "done"]
+    assert "diverged" in grid.ledger(runs[1]).log.read_text()
+    assert "diverged" not in grid.ledger(runs[0]).log.read_text()
+    (alone,) = supervised.attempts(grid, [runs[2]])
+    assert alone["cause"] is None
+
+
+def test_a_population_that_is_killed_goes_on_with_every_member(supervised: Supervised, tmp_path: Path) -> None:
+    """And whoever was done stays done: its process takes only those with it that were not."""
+    kwargs = {"fault": "kill", "marker": str(tmp_path / "marker")}
+    settings = {**TINY, "env": {"id": "tests.fault_env:make", "kwargs": kwargs}, "engine": "population",
+                **write_line_instances(tmp_path)}  # fmt: skip
+    axes = {"learner.gamma": [0.9, 0.8, 0.7]}
+    made = plan(write_grid(tmp_path, grid=axes, set=settings, seeds=[0]), tmp_path / "runs")
+    grid, runs = made.grid, made.manifest.runs()
+    assert [end["cause"] for end in supervised.attempts(grid, runs)] == [Cause.KILLED] * 3
+    assert [end["cause"] for end in supervised.attempts(grid, runs[1:], 2)] == [None] * 2
+    assert [end["cause"] for end in supervised.attempts(grid, runs, 3)] == [None] * 3
+    (tmp_path / "alone").mkdir()
+    unharmed = plan(write_grid(tmp_path / "alone", grid=axes, set=settings, seeds=[0]), tmp_path / "alone/runs")
+    for run in runs:
+        assert supervised.attempt(unharmed.grid, run)["cause"] is None
+        for name in (METRICS, "curriculum.jsonl", "model.npz"):
+            ours, other = (one.ledger(run).folder / name for one in (grid, unharmed.grid))
+            assert ours.read_bytes() == other.read_bytes(), name

@@ -24,7 +24,7 @@ from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.learner import Learner, OnPolicyLearner, make_learner
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
-from space_dist.rollout import Episodes, Shard, collect
+from space_dist.rollout import Episodes, Rollout, Shard, collect
 
 POINTMASS, LINE, DISCRETE_LINE = "space_dist/PointMass-v0", "tests.tiny_env:make", "tests.tiny_env:make_discrete"
 SLOTS, LENGTH = 3, 16  # per shard, where nothing else is said
@@ -54,11 +54,11 @@ def shards_of(learner: Learner, env_id: str = LINE, *, round: int = 0, length: i
     bounds = env.context_bounds
     contexts = np.random.default_rng(0).uniform(bounds.low, bounds.high, size=(5, len(bounds.names)))
     selection = Selection(0, np.arange(5), contexts, 0)
+    policy = learner.policy(round)
     return [
-        collect(env, learner.policy(round), selection, start=2 * shard, length=length, gamma=0.9, seed=1, round=round,
-                shard=shard)
+        collect(env, [Rollout(policy, selection, 2 * shard, 0.9, seed=1, round=round, shard=shard)], length=length)[0]
         for shard in range(n)
-    ]  # fmt: skip
+    ]
 
 
 def update(learner: Learner, number: int, env_id: str = LINE) -> dict[str, float]:

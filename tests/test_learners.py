@@ -15,17 +15,19 @@ import torch
 from gymnasium import spaces
 
 from space_dist import config as configs
+from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig
 from space_dist.envs.observations import Observations, rows
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, policy_of, private_ray
+from space_dist.launch import launch, policy_of, private_ray, read_instances
 from space_dist.learner import make_learner
 from space_dist.learner.networks import TorchPolicy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, decode_checkpoint
 from space_dist.policy import MlpPolicy
-from space_dist.training import learner_of
+from space_dist.rollout import Walk, Worker
+from space_dist.training import learner_of, make_setup
 from tests.test_learner import hand_made
 
 LINE, DISCRETE_LINE, SCALED = "tests.tiny_env:make", "tests.tiny_env:make_discrete", "tests.tiny_env:make_scaled"
@@ -660,3 +662,65 @@ def test_a_budget_of_steps_ends_rounds_of_episodes_too(tmp_path: Path) -> None:
     run(config, tmp_path / "run")
     assert config.n_episodes == 2
     assert Ledger(tmp_path / "run").status().steps == 48  # three rounds of two episodes of 8 steps
+
+
+# ---- collecting while updating ----
+
+
+@pytest.mark.parametrize("kind", ["ppo", "trpo", "a2c"])
+def test_rounds_collected_ahead_are_the_same_wherever_and_after_any_interruption(kind: str, tmp_path: Path) -> None:
+    curriculum = {"kind": "round_robin"}  # two rounds an iteration
+    settings = {"rollout": {"shards": 4, "slots": 2, "overlap": True, "passes": 4.0}, "curriculum": curriculum}
+    config = config_for(tmp_path, learner_section(kind), **settings)
+    expected = run(config, tmp_path / "reference")
+    iterations = [row for row in Ledger(tmp_path / "reference").rows() if row["kind"] == "iteration"]
+    assert [row["lagged_steps"] for row in iterations] == [N_STEPS] * 3
+    for rounds in range(1, ROUNDS):
+        folder = tmp_path / f"run{rounds}"
+        (interrupted if rounds % 2 else crashed)(config, folder, rounds)
+        assert run(config, folder) == expected, rounds
+    plain = config_for(tmp_path, learner_section(kind), **{**settings, "rollout": {"shards": 4, "slots": 2}})
+    assert run(plain, tmp_path / "plain")["metrics.jsonl"] != expected["metrics.jsonl"]
+
+
+def test_old_rounds_are_valued_by_the_weights_that_acted(tmp_path: Path) -> None:
+    """After updates on other rounds, values and log-probabilities are still those of the round's own policy."""
+    config = config_for(tmp_path, learner_section("ppo"))
+    setup = make_setup(config, *read_instances(config))
+    learner, fresh = learner_of(config), learner_of(config)
+    worker, selection = Worker(setup), make_curriculum(config, setup.train).start()[1]
+    asked: dict[str, Any] = {"steps": 0, "selection_version": 0}
+    first = [worker.collect(learner.policy(0), selection, Walk(-1, ()), round=0, shard=k, **asked) for k in range(4)]
+    acted = learner.scored()
+    learner.update(first, round=0, steps=N_STEPS)
+    behind = [worker.collect(fresh.policy(0), selection, Walk(-1, ()), round=1, shard=k, lag=1, **asked)
+              for k in range(4)]  # fmt: skip
+    with learner._weights(acted):
+        lagged = learner.fill(behind)  # type: ignore[attr-defined]
+    true = fresh.fill(behind)  # type: ignore[attr-defined]
+    for name in ("values", "log_probs", "advantages", "returns"):
+        assert np.array_equal(getattr(lagged, name), getattr(true, name)), name
+    now = learner.scored()
+    learner.update(behind, round=1, steps=2 * N_STEPS, acted=acted)
+    assert any(not np.array_equal(now[name], learner.scored()[name]) for name in now)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "words"),
+    [("sac", {}, "off-policy"), ("ppo", {"normalize_observations": True}, "normalize_observations"),
+     ("ppo", {"engine": "population"}, "engine: single")],
+)  # fmt: skip
+def test_overlap_is_refused_where_it_cannot_be(kind: str, changes: Any, words: str, tmp_path: Path) -> None:
+    engine = changes.pop("engine", "single")
+    rollout = {"shards": 4, "slots": 2, "overlap": True}
+    with pytest.raises(ConfigError, match=words):
+        config_for(tmp_path, learner_section(kind, **changes), rollout=rollout, engine=engine)
+
+
+@pytest.mark.ray
+@pytest.mark.usefixtures("one_ray")
+def test_rounds_collected_ahead_by_actors_are_the_same(tmp_path: Path) -> None:
+    rollout = {"shards": 4, "slots": 2, "overlap": True, "passes": 4.0}
+    config = config_for(tmp_path, learner_section("ppo"), rollout=rollout, curriculum={"kind": "round_robin"})
+    there = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 2})})
+    assert run(there, tmp_path / "actors") == run(config, tmp_path / "here")

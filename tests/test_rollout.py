@@ -18,12 +18,28 @@ from space_dist.envs import ContextObservation, make_batched
 from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.learner import make_learner
-from space_dist.policy import Actions, Head, MlpPolicy, Noise, forward, from_arrays, to_arrays
-from space_dist.rollout import CHUNK, CUT, TERMINATED, TRUNCATED, Outcomes, Setup, Shard, Walk, Worker, collect, joined
+from space_dist.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
+from space_dist.rollout import (
+    CHUNK,
+    CUT,
+    TERMINATED,
+    TRUNCATED,
+    Outcomes,
+    Rollout,
+    Setup,
+    Shard,
+    Trial,
+    Walk,
+    Worker,
+    collect,
+    evaluate,
+    joined,
+)
 from space_dist.seeding import Purpose, episode_seeds, generator
 from tests import tiny_env
 
 POINTMASS = "space_dist/PointMass-v0"
+CARTPOLE = "space_dist/CartPole-v0"
 LOW, HIGH = np.array([-4.0, 0.5, 0.0]), np.array([4.0, 8.0, 4.0])
 
 
@@ -57,7 +73,7 @@ class Countdown:
 
 def weights_for(
     observation_dim: int, outputs: int,
-    *, discrete: bool = False, version: int = 0, seed: int = 0, bias: float = 0.0, bound: float = 1.0,
+    *, discrete: bool = False, version: int = 0, seed: int = 0, bias: float = 0.0, bound: float = 1.0, hidden: int = 8,
 ) -> MlpPolicy:  # fmt: skip
     """A random network whose actions depend on what it sees; `bias` is added to its last output."""
     random = np.random.default_rng(seed)
@@ -68,7 +84,7 @@ def weights_for(
             for n, m in itertools.pairwise(sizes)
         )
 
-    actor, critic = layers(observation_dim, 8, outputs), layers(observation_dim, 8, 1)
+    actor, critic = layers(observation_dim, hidden, outputs), layers(observation_dim, hidden, 1)
     actor[-1][1][-1] += np.float32(bias)
     low, high = np.full(outputs, -bound, dtype=np.float32), np.full(outputs, bound, dtype=np.float32)
     log_std = np.full(outputs, 0.3, dtype=np.float32)
@@ -207,7 +223,7 @@ def test_discrete_actions_are_drawn_from_the_softmax() -> None:
     env = make_batched("tests.tiny_env:make_discrete", 256, context_visible=True)
     weights = weights_for(2, 3, discrete=True)
     contexts = np.random.default_rng(0).uniform(-1.0, 1.0, size=(50, 1))
-    shard = collect(env, weights, select(contexts), start=0, length=160, gamma=0.9, seed=0, round=0, shard=0)
+    (shard,) = collect(env, [Rollout(weights, select(contexts), 0, 0.9, seed=0, round=0, shard=0)], length=160)
     outputs = forward(weights.actor, weights.activation, shard.observations.reshape(-1, 2)).astype(np.float64)
     chances = np.exp(outputs - outputs.max(axis=1, keepdims=True))
     chances /= chances.sum(axis=1, keepdims=True)
@@ -227,10 +243,9 @@ def test_discrete_actions_are_drawn_from_the_softmax() -> None:
 
 def by_hand(lengths: list[float], *, start: int, length: int, slots: int = 2) -> Shard:
     contexts = np.array(lengths)[:, None]
-    return collect(
-        Countdown(slots), weights_for(2, 1), select(contexts, ids=10 * np.arange(len(lengths))),
-        start=start, length=length, gamma=0.5, seed=1, round=0, shard=0,
-    )  # fmt: skip
+    selection = select(contexts, ids=10 * np.arange(len(lengths)))
+    rollout = Rollout(weights_for(2, 1), selection, start, gamma=0.5, seed=1, round=0, shard=0)
+    return collect(Countdown(slots), [rollout], length=length)[0]
 
 
 def test_the_walk_by_hand() -> None:
@@ -287,7 +302,7 @@ def test_a_shards_table_tells_what_its_arrays_hold() -> None:
     env = make_batched(POINTMASS, slots, context_visible=True)
     contexts = uniform(7)
     selection = dataclasses.replace(select(contexts, version=3), order_version=2)
-    shard = collect(env, falling(version=5), selection, start=4, length=length, gamma=gamma, seed=2, round=5, shard=1)
+    (shard,) = collect(env, [Rollout(falling(version=5), selection, 4, gamma, seed=2, round=5, shard=1)], length=length)
     assert (shard.shard, shard.round, shard.policy_version, shard.selection_version, shard.order_version) == (
         1, 5, 5, 3, 2
     )  # fmt: skip
@@ -342,7 +357,7 @@ def test_a_shard_replays_by_hand_from_its_seeds() -> None:
     length, slots, seed = 110, 3, 6
     env = make_batched(POINTMASS, slots, context_visible=True)
     weights, selection = falling(version=2), select(uniform(4))
-    told = collect(env, weights, selection, start=0, length=length, gamma=0.9, seed=seed, round=2, shard=1)
+    (told,) = collect(env, [Rollout(weights, selection, 0, 0.9, seed=seed, round=2, shard=1)], length=length)
     seeds = episode_seeds(seed, Purpose.EPISODES, 2, 1, count=slots * length)
     single = ContextObservation(gym.make(POINTMASS))
     for row in range(len(told.episodes)):
@@ -525,3 +540,85 @@ def test_joined_chunks_equal_one_big_evaluation() -> None:
     scaled = 2.0 * (contexts - LOW) / (HIGH - LOW) - 1.0
     observed = np.concatenate([np.tile([0.0, 0.0, 3.0, 0.0], (n, 1)), scaled], axis=1).astype(np.float32)
     np.testing.assert_allclose(told, weights.values(observed), rtol=1e-5, atol=1e-6)
+
+
+# ---- side by side ----
+
+
+def same(one: object, other: object) -> bool:
+    """Equal to the last bit: two dataclasses of arrays, numbers and such dataclasses."""
+    for field in dataclasses.fields(one):  # type: ignore[arg-type]
+        left, right = getattr(one, field.name), getattr(other, field.name)
+        if dataclasses.is_dataclass(left):
+            equal = same(left, right)
+        elif isinstance(left, np.ndarray):
+            equal = left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes()
+        else:
+            equal = left == right
+        if not equal:
+            return False
+    return True
+
+
+def several(env_id: str, *, normalised: bool = False) -> list[MlpPolicy]:
+    space = make_batched(env_id, 1, context_visible=True)
+    size, n_actions = space.observation_space.shape[0], 2  # type: ignore[index]
+    policies = []
+    for seed in range(5):
+        policy = weights_for(size, n_actions, discrete=env_id == CARTPOLE, seed=seed)
+        scales = np.random.default_rng(seed)
+        statistics = Statistics(scales.normal(size=size), scales.uniform(0.5, 2.0, size=size), 1.5)
+        policies.append(dataclasses.replace(policy, version=seed, statistics=statistics) if normalised
+                        else dataclasses.replace(policy, version=seed))  # fmt: skip
+    return policies
+
+
+@pytest.mark.parametrize(("env_id", "normalised"), [(POINTMASS, False), (POINTMASS, True), (CARTPOLE, False)])
+@pytest.mark.parametrize("slots", [1, 3, 16])
+def test_a_shard_is_the_same_whoever_is_collected_beside_it(env_id: str, normalised: bool, slots: int) -> None:
+    bounds = make_batched(env_id, 1, context_visible=True).context_bounds
+    rollouts = []
+    for seed, policy in enumerate(several(env_id, normalised=normalised)):
+        contexts = np.random.default_rng(seed).uniform(bounds.low, bounds.high, size=(seed + 1, len(bounds.names)))
+        selection = select(contexts, version=seed)
+        rollouts.append(
+            Rollout(policy, selection, seed, 0.9 + seed / 100, seed=seed, round=policy.version, shard=seed % 2)
+        )
+    length = make_batched(env_id, 1, context_visible=True).horizon + 7
+    alone = [collect(make_batched(env_id, slots, context_visible=True), [one], length=length)[0] for one in rollouts]
+    for chosen in ([0, 1, 2, 3, 4], [4, 2], [3, 0, 1]):
+        env = make_batched(env_id, slots * len(chosen), context_visible=True)
+        together = collect(env, [rollouts[index] for index in chosen], length=length)
+        assert all(same(shard, alone[index]) for shard, index in zip(together, chosen, strict=True))
+    assert not same(alone[0].episodes, alone[1].episodes)
+
+
+@pytest.mark.parametrize(("env_id", "normalised"), [(POINTMASS, False), (POINTMASS, True), (CARTPOLE, False)])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_outcomes_are_the_same_whatever_is_measured_beside_them(env_id: str, normalised: bool, noisy: bool) -> None:
+    bounds = make_batched(env_id, 1, context_visible=True).context_bounds
+
+    def trials() -> list[Trial]:
+        made = []
+        for seed, policy in enumerate(several(env_id, normalised=normalised)):
+            random = np.random.default_rng(seed)
+            contexts = random.uniform(bounds.low, bounds.high, size=(7, len(bounds.names)))
+            seeds = random.integers(1 << 62, size=7).astype(np.uint64)
+            made.append(Trial(policy, contexts, seeds, 0.9 + seed / 100, random if noisy else None))
+        return made
+
+    alone = [evaluate(make_batched(env_id, 7, context_visible=True), [trial])[0] for trial in trials()]
+    for chosen in ([0, 1, 2, 3, 4], [4, 2], [3, 0, 1]):
+        env, again = make_batched(env_id, 7 * len(chosen), context_visible=True), trials()
+        together = evaluate(env, [again[index] for index in chosen])
+        assert all(same(outcomes, alone[index]) for outcomes, index in zip(together, chosen, strict=True))
+    assert not same(alone[0], alone[1])
+
+
+def test_only_equals_act_side_by_side() -> None:
+    env = make_batched(POINTMASS, 4, context_visible=True)
+    size = env.observation_space.shape[0]  # type: ignore[index]
+    one, other = weights_for(size, 2), weights_for(size, 2, hidden=9)
+    rollouts = [Rollout(policy, select(uniform(3)), 0, 0.9, seed=0, round=0, shard=0) for policy in (one, other)]
+    with pytest.raises(TypeError, match="one shape"):
+        collect(env, rollouts, length=5)

@@ -72,15 +72,15 @@ def checkpoint(
 
 def _seconds(name: str, settings: list[str]) -> tuple[float, int, float]:
     """Wall seconds of a run, its commits, and the wall seconds that they took, encoding included."""
-    from space_dist.training import Training
+    from space_dist.training import Training, Work
 
     spent: list[float] = []
     commit = Training._commit
 
-    def timed(self: Training, state: str, message: str | None = None) -> None:
-        self._settle()  # work that a commit waits for is none of its cost
+    def timed(self: Training, state: str, message: str | None = None) -> Work[None]:
+        yield from self._settle()  # work that a commit waits for is none of its cost
         start = time.perf_counter()
-        commit(self, state, message)
+        yield from commit(self, state, message)
         spent.append(time.perf_counter() - start)
 
     config = configs.load(ROOT / f"configs/{name}.yaml", ["tracking.uri=null", "resources.workers=0", *settings])

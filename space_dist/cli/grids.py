@@ -302,18 +302,16 @@ def grid_retry(
 @grid_app.command("work", hidden=True)
 def grid_work(
     folder: Path,
-    cell: str,
-    seed: Seed,
-    attempt: Annotated[int, typer.Option(min=1)],
+    turns: Annotated[list[str], typer.Argument(help="CELL:SEED:ATTEMPT of each run.")],
     nonce: Annotated[str, typer.Option()],
     job: Annotated[str, typer.Option()],
 ) -> None:
-    """One attempt of one run, as a job of its own."""
+    """One attempt of one run, or of several side by side, as a job of its own."""
     STOP.install()
     from space_dist.launch import lasting
     from space_dist.ray_pool import refuse_other_folder
     from space_dist.standing import Cause
-    from space_dist.supervisor import Busy, Supervisor, Task, preload
+    from space_dist.supervisor import Supervisor, Task, Turn, preload
 
     refuse_other_folder(lasting(folder, "the grid's folder"), nonce)
     preload()
@@ -324,13 +322,14 @@ def grid_work(
             return None
         return Cause.STOPPED if stop_file.exists() else Cause.PREEMPTED
 
-    task = Task(str(folder), cell, seed, attempt, "auto", {"job": job})
-    ended = Supervisor().attempt(task, stop_requested)
-    if isinstance(ended, Busy) or ended.cause is None:
-        return
-    warn(f"space-dist: {ended.cause.in_words}: {ended.detail}")
+    task = Task(str(folder), tuple(map(Turn.parse, turns)), "auto", {"job": job})
+    failed = [ended for ended in Supervisor().attempt(task, stop_requested) if ended.cause is not None]
+    for ended in failed:
+        warn(f"space-dist: {ended.cause.in_words if ended.cause else ''}: {ended.detail}")
     resumable = (Cause.STOPPED, Cause.PREEMPTED, Cause.TIMEOUT)
-    raise typer.Exit(75 if ended.cause in resumable else 2 if ended.cause is Cause.CONFIG_ERROR else 1)
+    codes = {75 if one.cause in resumable else 2 if one.cause is Cause.CONFIG_ERROR else 1 for one in failed}
+    if codes:
+        raise typer.Exit(min(codes, key=[1, 2, 75].index))
 
 
 def run_frozen(

@@ -76,6 +76,7 @@ def evaluate(
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of, stored_config
     from space_dist.ledger import Ledger
+    from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
     from space_dist.training import make_env
@@ -87,7 +88,7 @@ def evaluate(
     chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
     env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    outcome = evaluate_policy(env, policy, chosen.contexts, seeds, gamma=config.learner.gamma)
+    (outcome,) = evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])
     columns = {
         "return": outcome.returns, "discounted_return": outcome.discounted_returns, "length": outcome.lengths,
         "success": outcome.success,

@@ -29,6 +29,8 @@ from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
+from space_dist.learner.population import PopulationLearner, learn_together, stack_key
+from space_dist.learner.population import refuse as refuse_population
 
 
 def make_learner(
@@ -40,13 +42,20 @@ def make_learner(
     n_slots: int,
     slot_length: int,
     total_steps: int,
+    population: bool = False,
 ) -> Learner:
     """A config's learner with its initial networks, seeded.
 
-    n_slots, slot_length: of a round, over all shards; total_steps: of the run, for schedules.
+    n_slots, slot_length: of a round, over all shards; total_steps: of the run, for schedules. population: one whose
+    updates can be made together with others'.
     Raises ConfigError if the learner cannot work with these spaces.
     """
     torch.set_num_threads(1)  # 1 and 2 threads give different gradients
+    if population and isinstance(config, PPOConfig):
+        return PopulationLearner(
+            config, observation_space, action_space,
+            seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
+        )  # fmt: skip
     if isinstance(config, PPOConfig | TRPOConfig | A2CConfig):
         return OnPolicyLearner(
             config, observation_space, action_space,
@@ -82,9 +91,13 @@ __all__ = [
     "Learner",
     "OffPolicyLearner",
     "OnPolicyLearner",
+    "PopulationLearner",
     "Update",
+    "learn_together",
     "make_ensemble",
     "make_learner",
     "preload",
+    "refuse_population",
     "refuse_spaces",
+    "stack_key",
 ]

@@ -21,9 +21,10 @@ from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.policy import Policy, Statistics
 from space_dist.rollout import Shard
-from space_dist.seeding import Purpose, global_generators, seed_sequence
+from space_dist.seeding import Purpose, global_generators, global_seeds
 
 Arrays = dict[str, NDArray[Any]]
+NOT_A_NUMBER = "a weight is not a number"
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Learner(abc.ABC):
     ) -> None:
         self._config, self._seed, self._total_steps = config, seed, total_steps
         self._episode_advantages: NDArray[np.float64] | None = None  # of the last update
+        self._acted: Mapping[str, NDArray[Any]] | None = None  # for the present one
         refuse_spaces(config, observation_space, action_space)
         self._normaliser = (
             Normaliser(observation_space, config.gamma, config.normalize_observations, config.normalize_rewards)
@@ -106,10 +108,19 @@ class Learner(abc.ABC):
 
     def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Policy:
         """The policy of earlier weights, under the scales in force now."""
-        now = self.scored()
-        self.model.policy.load_state_dict({name: torch.as_tensor(array.copy()) for name, array in scored.items()})
-        try:
+        with self._weights(scored):
             return self.policy(version)
+
+    @contextmanager
+    def _weights(self, others: Mapping[str, NDArray[Any]] | None) -> Iterator[None]:
+        """Have other weights meanwhile: what `scored` gave earlier. None: these."""
+        if others is None:
+            yield
+            return
+        now = self.scored()
+        self.model.policy.load_state_dict({name: torch.as_tensor(array.copy()) for name, array in others.items()})
+        try:
+            yield
         finally:
             self.model.policy.load_state_dict({name: torch.as_tensor(array) for name, array in now.items()})
 
@@ -122,19 +133,29 @@ class Learner(abc.ABC):
         if self._normaliser is not None:
             self._normaliser.update(shards)
 
-    def update(self, shards: Sequence[Shard], *, round: int, steps: int) -> Update:
+    def update(
+        self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
         """One update on one round's shards, in shard order. `steps`: environment steps including this round's.
 
+        acted: the weights that the shards were collected with, if those are not the present ones (`scored` gave them).
         Raises SpaceDistError if the networks are no longer numbers.
         """
-        if [shard.shard for shard in shards] != list(range(len(shards))):
-            raise RuntimeError(f"shards arrived in the order {[shard.shard for shard in shards]}")
+        require_order(shards)
+        self._acted = acted
         before = self._gradient_steps()
         with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
             self._learn(shards, steps=steps)
             if not all(torch.isfinite(parameter).all() for parameter in self.model.policy.parameters()):
-                raise ValueError("a weight is not a number")
-        self.observe(shards)  # after learning: advantages and actions belong to the statistics that acted
+                raise ValueError(NOT_A_NUMBER)
+        return self._learnt(shards, before)
+
+    def _learnt(self, shards: Sequence[Shard], before: int) -> Update:
+        """What an update reports, of the gradient steps since there were `before`; the statistics take in the shards.
+
+        That comes after learning: advantages and actions belong to the statistics that acted.
+        """
+        self.observe(shards)
         recorded = self.model.logger.name_to_value
         metrics = {
             name.removeprefix("train/").removeprefix("rollout/"): float(value)
@@ -212,6 +233,12 @@ class Learner(abc.ABC):
         raise RuntimeError("this learner keeps no replay buffer")
 
 
+def require_order(shards: Sequence[Shard]) -> None:
+    """Raise RuntimeError unless a round's shards come in shard order."""
+    if [shard.shard for shard in shards] != list(range(len(shards))):
+        raise RuntimeError(f"shards arrived in the order {[shard.shard for shard in shards]}")
+
+
 def schedule(rate: float, kind: str) -> Any:
     """A learning rate as SB3 takes it: a number, or a function of the remaining share of the run."""
     return (lambda remaining: rate * remaining) if kind == "linear" else rate
@@ -244,7 +271,7 @@ def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], a
 def _seeded(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
     """Python's, NumPy's and torch's global generators seeded for one piece of work, and restored."""
     with global_generators(seed, purpose, *keys), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(seed_sequence(seed, purpose, *keys).generate_state(3, np.uint32)[2]))
+        torch.manual_seed(global_seeds(seed, purpose, *keys)[2])
         yield
 
 
@@ -256,7 +283,12 @@ def _divergence_explained(round: int) -> Iterator[None]:
     except (ValueError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "overflow" not in str(error):
             raise
-        raise SpaceDistError(
-            f"training diverged in update {round + 1}: the networks are no longer numbers. A smaller "
-            f"learner.learning_rate usually helps ({str(error).splitlines()[0][:120]})"
-        ) from error
+        raise divergence(round, str(error)) from error
+
+
+def divergence(round: int, reason: str) -> SpaceDistError:
+    """That an update's networks are no longer numbers, for users."""
+    return SpaceDistError(
+        f"training diverged in update {round + 1}: the networks are no longer numbers. A smaller "
+        f"learner.learning_rate usually helps ({reason.splitlines()[0][:120]})"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,16 @@ _OURS = {
     "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation", "log_std_init",
     "normalize_observations", "normalize_rewards", "update",
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The slots of all shards side by side: (length, slots, ...) each. ended: whether an episode did, at this step."""
+
+    observations: Observations
+    actions: NDArray[np.generic]
+    rewards: NDArray[np.float32]
+    ended: NDArray[np.bool_]
 
 
 class OnPolicyLearner(Learner):
@@ -90,7 +101,8 @@ class OnPolicyLearner(Learner):
         )
 
     def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
-        advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
+        with self._weights(self._acted):
+            advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
         self._episode_advantages = mean_sizes(shards, advantages) * self.statistics.reward_std
         self.model.num_timesteps = steps
         self.model._update_current_progress_remaining(steps, self._total_steps)
@@ -102,13 +114,8 @@ class OnPolicyLearner(Learner):
         As in SB3's own collecting, the value behind a truncated step is added to its reward, and an episode still
         running at the end is bootstrapped from the value of its last observation.
         """
-        policy, buffer, statistics = self.model.policy, self.model.rollout_buffer, self.statistics
-        observations = statistics.scaled(concatenate([shard.observations for shard in shards], axis=1))
-        actions = np.concatenate([shard.actions for shard in shards], axis=1)
-        rewards = np.concatenate([shard.rewards for shard in shards], axis=1)
-        rewards = self._normaliser.normalize_reward(rewards) if self._normaliser else rewards.astype(np.float32)
-        truncated = np.concatenate([shard.truncated for shard in shards], axis=1)
-        ended = np.concatenate([shard.terminated for shard in shards], axis=1) | truncated
+        policy, buffer, joined = self.model.policy, self.model.rollout_buffer, self.joined(shards)
+        observations, actions, rewards, ended = joined.observations, joined.actions, joined.rewards, joined.ended
         length, n_slots = rewards.shape
         with torch.no_grad():
             flat = each(lambda array: array.reshape(length * n_slots, *array.shape[2:]), observations)
@@ -134,6 +141,17 @@ class OnPolicyLearner(Learner):
         buffer.pos, buffer.full = length, True
         buffer.compute_returns_and_advantage(last_values=last_values, dones=ended[-1])
         return buffer
+
+    def joined(self, shards: Sequence[Shard]) -> Joined:
+        """A round's shards side by side, at the scales that acted."""
+        rewards = np.concatenate([shard.rewards for shard in shards], axis=1)
+        truncated = np.concatenate([shard.truncated for shard in shards], axis=1)
+        return Joined(
+            self.statistics.scaled(concatenate([shard.observations for shard in shards], axis=1)),
+            np.concatenate([shard.actions for shard in shards], axis=1),
+            self._normaliser.normalize_reward(rewards) if self._normaliser else rewards.astype(np.float32),
+            np.concatenate([shard.terminated for shard in shards], axis=1) | truncated,
+        )
 
     def _values(self, observations: Observations) -> NDArray[np.float32]:
         scaled = self.statistics.scaled(observations)

@@ -1,0 +1,153 @@
+"""Whether the population learns what Stable-Baselines3 learns: an equivalence test on PointMass.
+
+Fixed before any run is looked at: the metric (mean undiscounted return over the held-out instances after the last
+update), the margin (a share of the pilot's mean), both error rates, and how the number of seeds follows from SB3's own
+spread between seeds. The pilot's seeds are used for nothing else. SB3 against SB3 with other seeds is the control: what
+it does not pass, nobody could.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Optional
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from space_dist import config as configs
+from space_dist.errors import SpaceDistError
+from space_dist.manifest import Grid
+
+ROOT = Path(__file__).resolve().parents[2]
+MARGIN = 0.05  # share of the pilot's mean return
+ALPHA = 0.05  # of each one-sided test
+POWER = 0.8  # where there is no difference
+PILOT = range(1000, 1012)
+CONTROL = 500  # the first seed of the control
+FEWEST, MOST = 10, 60  # seeds per arm
+console = Console()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two arms. difference: of means, with its 90 % interval. p: of the two one-sided tests, the larger."""
+
+    name: str
+    means: tuple[float, float]
+    difference: float
+    low: float
+    high: float
+    p: float
+
+    @property
+    def equivalent(self) -> bool:
+        """Whether a difference as large as the margin can be ruled out."""
+        return self.p < ALPHA
+
+
+def equivalence(
+    curriculum: Annotated[str, typer.Option(help="Which config: pointmass_<curriculum>.yaml.")] = "round_robin",
+    steps: Annotated[int, typer.Option(min=4096, help="Environment steps of each run.")] = 102_400,
+    root: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Keep the runs here; what is done stays."),
+    ] = None,
+    max_parallel: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 2,
+    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+) -> None:
+    """TOST: the population engine against SB3 on PointMass, and SB3 against itself with other seeds."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = root or Path(temporary)
+        arms = _Arms(folder.absolute(), ROOT / f"configs/pointmass_{curriculum}.yaml", steps, max_parallel)
+        pilot = arms.returns("pilot", "single", list(PILOT))
+        margin, spread = MARGIN * float(pilot.mean()), float(pilot.std(ddof=1))
+        seeds = needed(spread, margin)
+        console.print(
+            f"pilot: SB3, {len(pilot)} seeds: mean {pilot.mean():.2f}, standard deviation {spread:.2f}; margin "
+            f"{margin:.2f} ({MARGIN:.0%}); {POWER:.0%} power needs {seeds} seeds an arm", highlight=False,
+        )  # fmt: skip
+        count = min(max(seeds, FEWEST), MOST)
+        reference = arms.returns("sb3", "single", list(range(count)))
+        other = arms.returns("control", "single", list(range(CONTROL, CONTROL + count)))
+        population = arms.returns("population", "population", list(range(2 * CONTROL - count, 2 * CONTROL)))
+    found = [
+        compare("population against SB3", population, reference, margin),
+        compare("SB3 against SB3, other seeds", other, reference, margin),
+    ]
+    table = Table(title=f"PointMass, {curriculum}, {steps:,} steps, {count} seeds an arm; margin {margin:.2f}")
+    for column in ("", "means", "difference [90 % interval]", "p (TOST)", "equivalent"):
+        table.add_column(column)
+    for one in found:
+        table.add_row(
+            one.name, " / ".join(f"{mean:.2f}" for mean in one.means),
+            f"{one.difference:+.2f} [{one.low:+.2f}, {one.high:+.2f}]", f"{one.p:.2g}",
+            "yes" if one.equivalent else "not shown",
+        )  # fmt: skip
+    console.print(table)
+    if seeds > MOST:
+        console.print(f"Only {MOST} of the {seeds} seeds an arm were run: the power is lower.", style="red")
+    if json_file is not None:
+        numbers = {"margin": margin, "pilot_std": spread, "seeds": count, "seeds_needed": seeds,
+                   "comparisons": [{**asdict(one), "equivalent": one.equivalent} for one in found]}  # fmt: skip
+        json_file.write_text(json.dumps(numbers, indent=1) + "\n")
+    if not found[0].equivalent:
+        raise typer.Exit(1)
+
+
+def needed(spread: float, margin: float) -> int:
+    """Seeds per arm for POWER if there is no difference (Phillips 1990) and all arms have this standard deviation."""
+    for count in range(2, 10_000):
+        freedom = 2 * count - 2
+        distance = margin / (spread * math.sqrt(2 / count))
+        if 2 * float(stats.t.cdf(distance - stats.t.ppf(1 - ALPHA, freedom), freedom)) - 1 >= POWER:
+            return count
+    raise SpaceDistError("no number of seeds would show equivalence within this margin")
+
+
+def compare(name: str, ours: NDArray[np.float64], theirs: NDArray[np.float64], margin: float) -> Comparison:
+    """Two one-sided Welch tests (Schuirmann 1987) on two samples of runs."""
+    lower = stats.ttest_ind(ours + margin, theirs, equal_var=False, alternative="greater")
+    upper = stats.ttest_ind(ours - margin, theirs, equal_var=False, alternative="less")
+    interval = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(1 - 2 * ALPHA)
+    return Comparison(
+        name, (float(ours.mean()), float(theirs.mean())), float(ours.mean() - theirs.mean()),
+        float(interval.low), float(interval.high), float(max(lower.pvalue, upper.pvalue)),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Arms:
+    folder: Path
+    config: Path
+    steps: int
+    max_parallel: int
+
+    def returns(self, name: str, engine: str, seeds: Sequence[int]) -> NDArray[np.float64]:
+        """(len(seeds),) the final held-out return of each run."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{name}.yaml"
+        path.write_text(configs.to_yaml({
+            "name": name, "extends": str(self.config), "seeds": list(seeds), "tracking": {"uri": None},
+            "set": {"budget.steps": self.steps, "engine": engine, "evaluation.every_steps": self.steps},
+        }))  # fmt: skip
+        command = [sys.executable, "-m", "space_dist.cli", "grid", "run", str(path), "--root", str(self.folder),
+                   "--max-parallel", str(self.max_parallel)]  # fmt: skip
+        if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
+            raise SpaceDistError(f"the arm {name} did not complete: {self.folder / name}")
+        grid = Grid(self.folder / name)
+        rows = [grid.ledger(run).rows() for run in grid.manifest().runs()]
+        finals = [[row for row in one if row["kind"] == "evaluation"][-1] for one in rows]
+        if {row["steps"] for row in finals} != {finals[0]["steps"]}:
+            raise SpaceDistError(f"the runs of {name} ended after different numbers of steps")
+        return np.array([row["test"]["return"] for row in finals])

@@ -1,0 +1,325 @@
+"""The population engine: learners of one shape whose updates are computed together, in one tensor program.
+
+Each learner owns its weights and its Adam state, in Stable-Baselines3's own objects, as if it were alone: a checkpoint
+cannot tell which engine wrote it, and a learner may be updated with others every time. For one update their parameters
+are copied into a stack (`stacked`) and back, which takes a few of the milliseconds that it lasts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.utils import explained_variance
+
+from space_dist.config import LearnerConfig, PPOConfig
+from space_dist.envs.observations import concatenate
+from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
+from space_dist.learner.on_policy import Joined, OnPolicyLearner, mean_sizes
+from space_dist.learner.stacked import PPO, ROWS, PPOReport, PPOSettings, Samples, Shape, Stack, rounded_up
+from space_dist.rollout import Shard
+from space_dist.seeding import Purpose, global_seeds
+
+Array = NDArray[np.float32]
+Floats = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class _Round:
+    """What one member collected, and what its networks made of it. values, advantages, returns: (length, slots)."""
+
+    shards: Sequence[Shard]
+    joined: Joined
+    values: Array
+    advantages: Array
+
+    @property
+    def returns(self) -> Array:
+        """What the critic is fitted to."""
+        return self.advantages + self.values
+
+
+class PopulationLearner(OnPolicyLearner):
+    """A member of a population: SB3's networks and optimiser, updated in a stack with others.
+
+    dtype: of weights and arithmetic; as in SB3's buffer, what it learns from is float32 in any case.
+    device: where updates are computed. key: equal for learners that can be updated together.
+    """
+
+    def __init__(
+        self,
+        config: PPOConfig,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        *,
+        seed: int,
+        n_slots: int,
+        slot_length: int,
+        total_steps: int,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+    ) -> None:
+        refuse(config, observation_space, action_space)
+        super().__init__(
+            config, observation_space, action_space,
+            seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
+        )  # fmt: skip
+        self.model.policy.to(dtype)
+        self.settings, self.seed, self.dtype, self.device = config, seed, dtype, torch.device(device)
+        self.shape = _shape(config, observation_space, action_space)
+        self.key = (stack_key(config, observation_space, action_space), dtype, device)
+
+    def update(
+        self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
+        """As `Learner.update`; the shards must be those of the present weights."""
+        if acted is not None:
+            raise RuntimeError("a population learns from rounds of its present weights only")
+        (result,) = learn_together([self], [shards], round=[round], steps=[steps])
+        if isinstance(result, SpaceDistError):
+            raise result
+        return result
+
+    def begin(self, steps: int) -> PPOSettings:
+        """What the update that ends at `steps` environment steps learns with."""
+        model, config = self.model, self.settings
+        model.num_timesteps = steps
+        model._update_current_progress_remaining(steps, self._total_steps)
+        model._update_learning_rate(model.policy.optimizer)
+        return PPOSettings(
+            learning_rate=model.policy.optimizer.param_groups[0]["lr"], clip_range=config.clip_range,
+            ent_coef=config.ent_coef, vf_coef=config.vf_coef, normalize_advantage=config.normalize_advantage,
+            max_grad_norm=math.inf if config.max_grad_norm is None else config.max_grad_norm,
+            target_kl=math.inf if config.target_kl is None else config.target_kl,
+        )  # fmt: skip
+
+    def conclude(self, stack: Stack, member: int, made: PPOReport, collected: _Round) -> Update:
+        """Take over a member's weights and Adam state, and report as SB3's PPO does."""
+        before, model, config = self._gradient_steps(), self.model, self.settings
+        for name, parameter in model.policy.named_parameters():
+            with torch.no_grad():
+                parameter.copy_(stack.parameter(stack.weights, name)[member])
+            model.policy.optimizer.state[parameter] = {
+                "step": stack.steps[member].to("cpu", copy=True),
+                "exp_avg": stack.parameter(stack.exp_avg, name)[member].cpu().clone(),
+                "exp_avg_sq": stack.parameter(stack.exp_avg_sq, name)[member].cpu().clone(),
+            }
+        model._n_updates += made.epochs
+        entropy, policy, value = made.entropy_losses, made.policy_losses, made.value_losses
+        metrics = {
+            "entropy_loss": entropy.mean(),
+            "policy_gradient_loss": policy.mean(),
+            "value_loss": value.mean(),
+            "approx_kl": made.divergences[made.last_epoch :].mean(),
+            "clip_fraction": made.clip_fractions.mean(),
+            "loss": policy[-1] + config.ent_coef * entropy[-1] + config.vf_coef * value[-1],
+            "explained_variance": explained_variance(collected.values.flatten(), collected.returns.flatten()),
+            "n_updates": model._n_updates,
+            "clip_range": config.clip_range,
+        }
+        if not self.shape.discrete:
+            metrics["std"] = torch.exp(model.policy.log_std).mean().item()
+        for name, metric in metrics.items():
+            model.logger.record(f"train/{name}", metric)
+        sizes = mean_sizes(collected.shards, collected.advantages)
+        self._episode_advantages = sizes * self.statistics.reward_std
+        return self._learnt(collected.shards, before)
+
+
+def refuse(config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Raise ConfigError where the population engine cannot learn."""
+    if not isinstance(config, PPOConfig):
+        raise ConfigError(f"engine: population learns with learner.kind: ppo, not {config.kind}")
+    if config.policy != "MlpPolicy":
+        raise ConfigError(f"engine: population learns with learner.policy: MlpPolicy, not {config.policy}")
+    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+        raise ConfigError(
+            f"engine: population needs flat observations (a one-dimensional Box), not {observation_space}"
+        )
+    flat = isinstance(action_space, spaces.Box) and len(action_space.shape) == 1
+    if not flat and not isinstance(action_space, spaces.Discrete):
+        raise ConfigError(
+            f"engine: population needs actions that are a one-dimensional Box or Discrete, not {action_space}"
+        )
+
+
+def stack_key(config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Hashable:
+    """Equal for learners that can be updated together. Raises ConfigError as `refuse`."""
+    refuse(config, observation_space, action_space)
+    if not isinstance(config, PPOConfig):
+        raise TypeError(config)
+    shape = _shape(config, observation_space, action_space)
+    return (config.kind, shape, config.n_steps, config.batch_size, config.n_epochs)
+
+
+def _shape(config: PPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Shape:
+    outputs = action_space.n if isinstance(action_space, spaces.Discrete) else np.prod(action_space.shape or ())
+    return Shape(
+        inputs=int(np.prod(observation_space.shape or ())), outputs=int(outputs),
+        discrete=isinstance(action_space, spaces.Discrete),
+        hidden=tuple(config.net_arch), activation=config.activation,
+    )  # fmt: skip
+
+
+def learn_together(
+    learners: Sequence[PopulationLearner],
+    rounds: Sequence[Sequence[Shard]],
+    *,
+    round: Sequence[int],
+    steps: Sequence[int],
+) -> list[Update | SpaceDistError]:
+    """One update of every learner, on its own round's shards; of one whose networks are no numbers then, the error.
+
+    round, steps: each learner's, as in `Learner.update`. Raises RuntimeError if the learners' keys are not equal.
+    """
+    if len({learner.key for learner in learners}) != 1:
+        raise RuntimeError(f"learners of different shapes cannot learn together: {[one.key for one in learners]}")
+    for shards in rounds:
+        require_order(shards)
+    # One alone is its own companion: matrices that are not stacked may be multiplied in another way.
+    members = [*learners, *learners][: max(2, len(learners))]
+    shards_of, round_of, steps_of = ([*given, *given][: len(members)] for given in (rounds, round, steps))
+    stack = _stacked(members)
+    collected, samples = _evaluated(stack, members, shards_of)
+    config = members[0].settings
+    randoms = [_random(learner.seed, number) for learner, number in zip(members, round_of, strict=True)]
+    orders = (np.stack([random.permutation(config.n_steps) for random in randoms]) for _ in range(config.n_epochs))
+    settings = [learner.begin(reached) for learner, reached in zip(members, steps_of, strict=True)]
+    reports = PPO(stack, samples, settings, config.batch_size).run(orders)
+    finite = stack.finite()
+    return [
+        learner.conclude(stack, member, reports[member], collected[member])
+        if finite[member]
+        else divergence(round[member], NOT_A_NUMBER)
+        for member, learner in enumerate(learners)
+    ]
+
+
+def _random(seed: int, round: int) -> np.random.RandomState:
+    """What SB3 would draw an update's permutations from, were NumPy's global generator seeded for it."""
+    return np.random.RandomState(global_seeds(seed, Purpose.UPDATE, round)[1])
+
+
+def _stacked(members: Sequence[PopulationLearner]) -> Stack:
+    """Weights and Adam state of all members, copied."""
+    first = members[0]
+    stack = Stack(first.shape, len(members), device=first.device, dtype=first.dtype)
+    parameters = [dict(learner.model.policy.named_parameters()) for learner in members]
+    states = [learner.model.policy.optimizer.state for learner in members]
+    for name in stack.layout.names:
+        mine = [one[name] for one in parameters]
+        stack.parameter(stack.weights, name).copy_(torch.stack([parameter.detach() for parameter in mine]))
+        for moment, rows in (("exp_avg", stack.exp_avg), ("exp_avg_sq", stack.exp_avg_sq)):
+            moments = [
+                state[parameter][moment] if parameter in state else torch.zeros_like(parameter)
+                for state, parameter in zip(states, mine, strict=True)
+            ]
+            stack.parameter(rows, name).copy_(torch.stack(moments))
+    stack.steps.copy_(torch.tensor([float(learner._gradient_steps()) for learner in members]))
+    return stack
+
+
+def _evaluated(
+    stack: Stack, members: Sequence[PopulationLearner], rounds: Sequence[Sequence[Shard]]
+) -> tuple[list[_Round], Samples]:
+    """What the members collected, with values, log-probabilities and advantages under the weights that acted.
+
+    As in `OnPolicyLearner.fill`: the value behind a truncated step is added to its reward, and an episode still running
+    at the end is bootstrapped from the value of its last observation.
+    """
+    joined = [learner.joined(shards) for learner, shards in zip(members, rounds, strict=True)]
+    config = members[0].settings
+    count = config.n_steps
+    rows = rounded_up(min(config.batch_size, count), ROWS)
+    beyond = [
+        learner.statistics.scaled(
+            concatenate([*(one.truncated_observations for one in shards), *(one.last_observations for one in shards)])
+        )
+        for learner, shards in zip(members, rounds, strict=True)
+    ]
+    length = rounded_up(count + max(len(one) for one in beyond), rows)
+    observations = np.zeros((len(members), length, stack.shape.inputs), dtype=np.float32)
+    width, kind = (1, np.int64) if stack.shape.discrete else (stack.shape.outputs, np.float32)
+    actions = np.zeros((len(members), length, width), dtype=kind)
+    for member, (one, more) in enumerate(zip(joined, beyond, strict=True)):
+        if isinstance(one.observations, dict) or isinstance(more, dict):
+            raise TypeError("a population takes flat observations")
+        observations[member, :count] = _flat(one.observations)
+        observations[member, count : count + len(more)] = more
+        actions[member, :count] = _flat(one.actions).reshape(count, -1)
+    seen, done = (torch.from_numpy(array).to(stack.device) for array in (observations, actions))
+    values, log_probs = stack.evaluate(seen, done, rows)
+    collected = _advantages_of(members, rounds, joined, values.cpu().numpy())
+
+    def together(arrays: Sequence[Array]) -> torch.Tensor:
+        return torch.from_numpy(np.stack([_flat(array) for array in arrays])).to(stack.device)
+
+    return collected, Samples(
+        observations=seen[:, :count].contiguous(), actions=done[:, :count].contiguous(),
+        log_probs=log_probs[:, :count].float().contiguous(),
+        advantages=together([one.advantages for one in collected]),
+        returns=together([one.returns for one in collected]),
+    )  # fmt: skip
+
+
+def _advantages_of(
+    members: Sequence[PopulationLearner], rounds: Sequence[Sequence[Shard]], joined: Sequence[Joined], values: Floats
+) -> list[_Round]:
+    """values: (members, all) of the samples, slot by slot, then of truncated episodes' ends, then of the slots' ends.
+
+    Members whose slots are equally many and long are computed together.
+    """
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for member, one in enumerate(joined):
+        groups.setdefault(one.rewards.shape, []).append(member)
+    collected: dict[int, _Round] = {}
+    for (length, slots), group in groups.items():
+        count = length * slots
+        mine = values[group, :count].astype(np.float32).reshape(len(group), slots, length).transpose(2, 0, 1)
+        rewards = np.stack([joined[member].rewards for member in group], axis=1)
+        last_values = np.empty((len(group), slots), dtype=values.dtype)
+        for index, member in enumerate(group):
+            first_slot, first = 0, count
+            for shard in rounds[member]:
+                places = np.argwhere(shard.truncated)
+                behind = values[member, first : first + len(places)]
+                rewards[places[:, 0], index, places[:, 1] + first_slot] += members[member].settings.gamma * behind
+                first_slot, first = first_slot + shard.rewards.shape[1], first + len(places)
+            last_values[index] = values[member, first : first + slots]
+        gammas = [members[member].settings.gamma for member in group]
+        decays = [members[member].settings.gamma * members[member].settings.gae_lambda for member in group]
+        advantages = _advantages(
+            rewards, mine, last_values, np.stack([joined[member].ended for member in group], axis=1),
+            *(np.array(numbers, dtype=np.float32)[:, None] for numbers in (gammas, decays)),
+        )  # fmt: skip
+        for index, member in enumerate(group):
+            collected[member] = _Round(rounds[member], joined[member], mine[:, index], advantages[:, index])
+    return [collected[member] for member in range(len(members))]
+
+
+def _flat(array: NDArray[Any]) -> NDArray[Any]:
+    """`(length, slots, ...) -> (slots * length, ...)`, as SB3's buffer does before it draws minibatches."""
+    return array.swapaxes(0, 1).reshape(-1, *array.shape[2:])
+
+
+def _advantages(
+    rewards: Array, values: Array, last_values: Floats, ended: NDArray[np.bool_], gammas: Array, decays: Array
+) -> Array:
+    """Generalised advantages, (length, members, slots), as SB3's buffer computes them, to the bit.
+
+    rewards, values, ended: likewise.  last_values: (members, slots).  gammas, decays (gamma lambda): (members, 1).
+    """
+    advantages = np.empty_like(rewards)
+    following, behind = np.zeros_like(last_values), last_values
+    for time in range(len(rewards) - 1, -1, -1):
+        going_on = 1 - ended[time].astype(np.float32)
+        following = rewards[time] + gammas * behind * going_on - values[time] + decays * going_on * following
+        advantages[time], behind = following, values[time]
+    return advantages

@@ -1,0 +1,511 @@
+"""Many actor-critics of one shape updated in one tensor program: PPO as in Stable-Baselines3's `PPO.train`.
+
+Everything has the members along its first axis. A member is two networks of one architecture, its actor and its critic
+(whose output is the first of as many as the actor has), so P members are 2P networks, and a layer is one batched matrix
+product. The gradients are written by hand:
+
+    log pi(a|s)    Gaussian -|z|^2/2 - sum(log sigma) - n/2 log(2 pi), z = (a - mu) / sigma; or the log-softmax at a
+    r = exp(log pi - log pi_old)
+    policy loss    -mean(min(A r, A clip(r, 1 - eps, 1 + eps)))        d/d log pi = -A r / B where the first is least
+    value loss     mean((V - R)^2)
+    entropy loss   -mean(H)
+    loss           policy loss + ent_coef * entropy loss + vf_coef * value loss
+
+then the member's gradient is scaled to at most `max_grad_norm`, and its Adam makes a step.
+
+On a CPU a member's bits do not depend on the others. Matrix products and reductions go member by member; what is left
+are elementwise functions, of which vectorised loops compute the last few elements of an array in another way: so every
+member's rows are a multiple of ROWS, and such ends lie within no array.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+ROWS = 32  # a multiple of twice any CPU's vector of float32
+ACTOR, CRITIC = 0, 1
+BETAS, EPS = (0.9, 0.999), 1e-5  # Adam's, in SB3's actor-critic policies
+Array = NDArray[np.floating[Any]]
+LOG_2PI = math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What the networks of all members of a stack have in common.
+
+    inputs: of an observation.  outputs: action dimensions, or discrete actions.  hidden: units of each hidden layer.
+    """
+
+    inputs: int
+    outputs: int
+    discrete: bool
+    hidden: tuple[int, ...]
+    activation: Literal["tanh", "relu"]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Units of each layer, the inputs first."""
+        return (self.inputs, *self.hidden, self.outputs)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a parameter lies within the row of a network."""
+
+    first: int
+    shape: tuple[int, ...]
+
+    def of(self, rows: torch.Tensor) -> torch.Tensor:
+        """`(..., *shape)` views of (..., length) rows."""
+        return split(rows[..., self.first : self.first + math.prod(self.shape)], -1, self.shape)
+
+
+class Layout:
+    """The row of a network: log_std, then weights and biases of each layer, each at a multiple of 64 bytes.
+
+    Hidden layers' weights are (in, out), the last layer's (out, in), where the products are fastest.
+    names: SB3's, of all parameters: of which network, where, and whether SB3 has it the other way round.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        self._length = 0
+        self.log_std = self._place(shape.outputs)
+        sizes = shape.sizes
+        self.weights, self.biases = [], []
+        for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+            last = layer == len(sizes) - 2
+            self.weights.append(self._place(n_out, n_in) if last else self._place(n_in, n_out))
+            self.biases.append(self._place(n_out))
+        self.names = dict(self._names(shape))
+
+    def _names(self, shape: Shape) -> Iterator[tuple[str, tuple[int, Place, bool]]]:
+        if not shape.discrete:
+            yield "log_std", (ACTOR, self.log_std, False)
+        for network, name, head in ((ACTOR, "policy", "action"), (CRITIC, "value", "value")):
+            for layer in range(len(shape.hidden)):
+                yield f"mlp_extractor.{name}_net.{2 * layer}.weight", (network, self.weights[layer], True)
+                yield f"mlp_extractor.{name}_net.{2 * layer}.bias", (network, self.biases[layer], False)
+            yield f"{head}_net.weight", (network, self.weights[-1], False)
+            yield f"{head}_net.bias", (network, self.biases[-1], False)
+
+    def _place(self, *shape: int) -> Place:
+        place = Place(self._length, shape)
+        self._length = rounded_up(self._length + math.prod(shape), 16)
+        return place
+
+    @property
+    def length(self) -> int:
+        """Numbers in a row, padding included."""
+        return rounded_up(self._length, ROWS)
+
+
+class Stack:
+    """Weights, gradients and Adam's state of P members: (P, 2, length) each, actors before critics.
+
+    steps: (P,) that each member's Adam has made.
+    """
+
+    def __init__(self, shape: Shape, members: int, *, device: torch.device, dtype: torch.dtype) -> None:
+        self.shape, self.layout = shape, Layout(shape)
+        self.members, self.device, self.dtype = members, device, dtype
+        rows = (members, 2, self.layout.length)
+        self.weights = torch.zeros(rows, device=device, dtype=dtype)
+        self.gradient = torch.zeros(rows, device=device, dtype=dtype)
+        self.exp_avg = torch.zeros(rows, device=device, dtype=dtype)
+        self.exp_avg_sq = torch.zeros(rows, device=device, dtype=dtype)
+        self.steps = torch.zeros(members, device=device)
+        self._networks: dict[int, Networks] = {}
+
+    def parameter(self, rows: torch.Tensor, name: str) -> torch.Tensor:
+        """`(P, ...)` view of the parameter that SB3 calls `name`, laid out as SB3's, in one of our (P, 2, length)."""
+        network, place, transposed = self.layout.names[name]
+        found = place.of(rows[:, network])
+        if name.startswith("value_net."):
+            found = found[:, :1]
+        return found.transpose(1, 2) if transposed else found
+
+    def networks(self, rows: int) -> Networks:
+        """All 2P networks, for so many rows of inputs each; the same object for the same number."""
+        if rows not in self._networks:
+            self._networks[rows] = Networks(self, self.weights.flatten(0, 1), self.gradient.flatten(0, 1), rows)
+        return self._networks[rows]
+
+    def evaluate(
+        self, observations: torch.Tensor, actions: torch.Tensor, rows: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """`(P, n, inputs), (P, n, action dimensions) -> (P, n), (P, n)` values and log-probabilities; n: k * `rows`."""
+        members, count = observations.shape[:2]
+        outputs = torch.empty(members, 2, self.shape.outputs, count, device=self.device, dtype=self.dtype)
+        networks = self.networks(rows)
+        for first in range(0, count, rows):
+            piece = observations[:, None, first : first + rows].to(self.dtype)
+            some = networks.forward(piece.expand(-1, 2, -1, -1).flatten(0, 1))
+            outputs[..., first : first + rows] = split(some, 0, (members, 2))
+        log_probs = torch.zeros(members, count, device=self.device, dtype=self.dtype)
+        head = head_of(self, outputs[:, ACTOR].contiguous(), outputs[:, ACTOR], count)
+        head.log_prob(actions.transpose(1, 2).contiguous(), log_probs, log_probs)
+        return outputs[:, CRITIC, 0], log_probs
+
+    def finite(self) -> list[bool]:
+        """Whether each member's weights are numbers."""
+        return [bool(finite) for finite in torch.isfinite(self.weights).flatten(1).all(1).tolist()]
+
+
+class Networks:
+    """Forward and backward passes of R networks, one for each row of `weights` (R, length), on `rows` inputs each."""
+
+    def __init__(self, stack: Stack, weights: torch.Tensor, gradient: torch.Tensor, rows: int) -> None:
+        layout, shape = stack.layout, stack.shape
+        count = len(weights)
+        self._tanh = shape.activation == "tanh"
+        self._weights = [place.of(weights) for place in layout.weights]
+        self._biases = [place.of(weights)[:, None, :] for place in layout.biases[:-1]]
+        self._biases.append(layout.biases[-1].of(weights)[:, :, None])
+        self._weight_gradients = [place.of(gradient) for place in layout.weights]
+        self._bias_gradients = [place.of(gradient) for place in layout.biases]
+
+        def empty(*sizes: int) -> torch.Tensor:
+            return torch.zeros(count, *sizes, device=stack.device, dtype=stack.dtype)
+
+        self._hidden = [empty(rows, n) for n in shape.hidden]
+        self._hidden_gradients = [empty(rows, n) for n in shape.hidden]
+        self._scratch = [empty(*place.shape) for place in layout.weights]
+        self._transposed = [empty(n_out, n_in) for n_in, n_out in zip(shape.sizes[:-2], shape.sizes[1:-1], strict=True)]
+        self.outputs = empty(shape.outputs, rows)
+        self.output_gradients = empty(shape.outputs, rows)
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        """`(R, rows, inputs) -> (R, outputs, rows)`, in `outputs`."""
+        for layer, hidden in enumerate(self._hidden):
+            torch.baddbmm(self._biases[layer], inputs, self._weights[layer], out=hidden)
+            if self._tanh:
+                torch.tanh(hidden, out=hidden)
+            else:
+                torch.relu_(hidden)
+            inputs = hidden
+        return torch.baddbmm(self._biases[-1], self._weights[-1], inputs.transpose(1, 2), out=self.outputs)
+
+    def backward(self, inputs: torch.Tensor) -> None:
+        """Write the gradient of every weight, given `output_gradients`, of the last `forward`'s `inputs`."""
+        given = self.output_gradients
+        below = self._hidden[-1] if self._hidden else inputs
+        torch.bmm(given, below, out=self._scratch[-1])
+        self._weight_gradients[-1].copy_(self._scratch[-1])
+        torch.sum(given, dim=2, out=self._bias_gradients[-1])
+        for layer in reversed(range(len(self._hidden))):
+            gradient, hidden = self._hidden_gradients[layer], self._hidden[layer]
+            if layer == len(self._hidden) - 1:
+                torch.bmm(given.transpose(1, 2), self._weights[-1], out=gradient)
+            else:  # twice as fast as the product with a transposed view
+                self._transposed[layer + 1].copy_(self._weights[layer + 1].transpose(1, 2))
+                torch.bmm(given, self._transposed[layer + 1], out=gradient)
+            if self._tanh:
+                torch.ops.aten.tanh_backward.grad_input(gradient, hidden, grad_input=gradient)
+            else:
+                torch.ops.aten.threshold_backward.grad_input(gradient, hidden, 0.0, grad_input=gradient)
+            below = self._hidden[layer - 1] if layer else inputs
+            torch.bmm(below.transpose(1, 2), gradient, out=self._scratch[layer])
+            self._weight_gradients[layer].copy_(self._scratch[layer])
+            torch.sum(gradient, dim=1, out=self._bias_gradients[layer])
+            given = gradient
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What P members learn from: N samples each, in float32 as SB3's buffer keeps them, on the stack's device.
+
+    observations: (P, N, inputs).  actions: (P, N, action dimensions), or (P, N, 1) numbers of discrete ones.
+    log_probs, advantages, returns: (P, N).
+    """
+
+    observations: torch.Tensor
+    actions: torch.Tensor
+    log_probs: torch.Tensor
+    advantages: torch.Tensor
+    returns: torch.Tensor
+
+
+@dataclass(frozen=True)
+class PPOSettings:
+    """One member's own. max_grad_norm: infinite where gradients are not clipped.  target_kl: likewise, epochs."""
+
+    learning_rate: float
+    clip_range: float
+    ent_coef: float
+    vf_coef: float
+    max_grad_norm: float
+    target_kl: float
+    normalize_advantage: bool
+
+
+@dataclass(frozen=True)
+class PPOReport:
+    """One member's minibatches, in order, the last one of which may have been refused by target_kl.
+
+    policy_losses, value_losses, entropy_losses, divergences, clip_fractions: (minibatches,).  epochs: begun.
+    last_epoch: the first minibatch of the last epoch.
+    """
+
+    policy_losses: Array
+    value_losses: Array
+    entropy_losses: Array
+    divergences: Array
+    clip_fractions: Array
+    epochs: int
+    last_epoch: int
+
+
+class _Minibatches:
+    """`count` minibatches of `size` samples a member, gathered: everything in rows of a multiple of ROWS.
+
+    inputs: (count, 2P, rows, inputs).  actions: (count, P, action dimensions, rows).  minus_log_probs, returns: (count,
+    P, rows).  pulls: minus the advantages, divided by the size.
+    """
+
+    def __init__(self, samples: Samples, places: NDArray[np.int64], size: int, normalized: torch.Tensor, stack: Stack):
+        members, count = places.shape[0], places.shape[1] // size
+        self.count, self.size, self.rows = count, size, rounded_up(size, ROWS)
+        index = np.zeros((count, members, self.rows), dtype=np.int64)
+        index += np.arange(members)[:, None] * samples.returns.shape[1]
+        index[:, :, :size] += places.reshape(members, count, size).swapaxes(0, 1)
+        twice = np.repeat(index[:, :, None], 2, axis=2)
+        once, both = (torch.from_numpy(array.reshape(-1)).to(stack.device) for array in (index, twice))
+
+        def gathered(tensor: torch.Tensor, which: torch.Tensor = once) -> torch.Tensor:
+            return tensor.flatten(0, 1).index_select(0, which)
+
+        width = samples.observations.shape[2]
+        self.inputs = gathered(samples.observations, both).view(count, 2 * members, self.rows, width).to(stack.dtype)
+        actions = gathered(samples.actions).view(count, members, self.rows, -1).transpose(2, 3).contiguous()
+        self.actions = actions if stack.shape.discrete else actions.to(stack.dtype)
+        self.minus_log_probs = -gathered(samples.log_probs).view(count, members, self.rows).to(stack.dtype)
+        self.returns = gathered(samples.returns).view(count, members, self.rows).to(stack.dtype)
+        pulls = gathered(samples.advantages).view(count, members, self.rows)
+        if size > 1:  # as SB3, and as there in float32
+            mean, deviation = (of(pulls[:, :, :size], dim=2, keepdim=True) for of in (torch.mean, torch.std))
+            pulls -= mean * normalized
+            pulls /= torch.where(normalized > 0.0, deviation + 1e-8, 1.0)
+        self.pulls = pulls.to(stack.dtype)
+        self.pulls /= -size
+        self.pulls[:, :, size:] = 0.0
+
+
+class PPO:
+    """The epochs of one update of all members."""
+
+    def __init__(
+        self, stack: Stack, samples: Samples, settings: Sequence[PPOSettings], batch_size: int
+    ) -> None:  # fmt: skip
+        self._stack, self._samples, self._settings = stack, samples, settings
+        self._batch_size = batch_size
+
+        def column(name: str) -> torch.Tensor:
+            values = [[getattr(one, name)] for one in settings]
+            return torch.tensor(values, dtype=stack.dtype, device=stack.device)
+
+        self._entropy, self._vf, self._max_norm = column("ent_coef"), column("vf_coef"), column("max_grad_norm")
+        self._clip, self._normalized = column("clip_range"), column("normalize_advantage").float()
+        ranges = torch.tensor([[one.clip_range] for one in settings], dtype=torch.float64)
+        self._low, self._high = (bound.to(stack.device, stack.dtype) for bound in (1.0 - ranges, 1.0 + ranges))
+        self._limits = torch.tensor([1.5 * one.target_kl for one in settings], device=stack.device, dtype=stack.dtype)
+        self._watched = any(math.isfinite(one.target_kl) for one in settings)
+        self._adam = Adam(stack, [one.learning_rate for one in settings])
+
+    def run(self, orders: Iterable[NDArray[np.int64]]) -> list[PPOReport]:
+        """One epoch for each (P, N) of `orders`: each member's permutation of its samples."""
+        members = self._stack.members
+        self._active = [True] * members
+        made, epochs, last = [0] * members, [0] * members, [0] * members
+        records: list[tuple[torch.Tensor, ...]] = []
+        for order in orders:
+            if not any(self._active):
+                break
+            for member in range(members):
+                if self._active[member]:
+                    last[member], epochs[member] = made[member], epochs[member] + 1
+            whole = order.shape[1] // self._batch_size * self._batch_size
+            for part, size in ((order[:, :whole], self._batch_size), (order[:, whole:], order.shape[1] - whole)):
+                if part.size:
+                    batches = _Minibatches(self._samples, part, size, self._normalized, self._stack)
+                    records.append(self._learn(batches, made))
+        columns = [torch.cat(parts).cpu().numpy() for parts in zip(*records, strict=True)]
+        reports = []
+        for member in range(members):
+            policy, value, entropy, divergence, clipped = (column[: made[member], member] for column in columns)
+            reports.append(PPOReport(policy, value, entropy, divergence, clipped, epochs[member], last[member]))
+        return reports
+
+    def _learn(self, batches: _Minibatches, made: list[int]) -> tuple[torch.Tensor, ...]:
+        """All minibatches. Returns (count, P) policy, value and entropy losses, divergences, clip fractions."""
+        stack, members, size, rows = self._stack, self._stack.members, batches.size, batches.rows
+        networks = stack.networks(rows)
+        outputs = split(networks.outputs, 0, (members, 2))
+        gradients = split(networks.output_gradients, 0, (members, 2))
+        values, value_gradients = outputs[:, CRITIC, 0], gradients[:, CRITIC, 0]
+        head = head_of(stack, outputs[:, ACTOR], gradients[:, ACTOR], size)
+        log_ratios, losses, errors = (torch.empty_like(batches.returns) for _ in range(3))
+        entropies = torch.empty(batches.count, members, device=stack.device, dtype=stack.dtype)
+        low, high = (bound.expand(members, rows).contiguous() for bound in (self._low, self._high))
+        value_scale = (self._vf * 2.0 / size).expand(members, rows).contiguous()
+        value_scale[:, size:] = 0.0
+        for index in range(batches.count):
+            inputs, log_ratio = batches.inputs[index], log_ratios[index]
+            networks.forward(inputs)
+            head.log_prob(batches.actions[index], batches.minus_log_probs[index], log_ratio)
+            head.entropy(entropies[index])
+            ratio = torch.exp(log_ratio)
+            pull = ratio * batches.pulls[index]
+            clipped = torch.clamp(ratio, low, high).mul_(batches.pulls[index])
+            torch.maximum(pull, clipped, out=losses[index])
+            pull.mul_(pull >= clipped)
+            torch.sub(values, batches.returns[index], out=errors[index])
+            for member, active in enumerate(self._active):
+                made[member] += active
+            if self._watched and not self._keep_going(log_ratio[:, :size]):
+                break
+            torch.mul(errors[index], value_scale, out=value_gradients)
+            head.backward(pull, self._entropy)
+            networks.backward(inputs)
+            self.gradient_step()
+        return (
+            losses[:, :, :size].sum(2), errors[:, :, :size].square().mean(2), -entropies,
+            _divergence(log_ratios[:, :, :size]),
+            ((log_ratios[:, :, :size].exp() - 1.0).abs() > self._clip).to(stack.dtype).mean(2),
+        )  # fmt: skip
+
+    def gradient_step(self) -> None:
+        """Clip each member's gradient, and let its Adam make a step."""
+        norms = torch.linalg.vector_norm(self._stack.gradient, dim=(1, 2)).add_(1e-6)
+        self._stack.gradient.mul_(torch.div(self._max_norm[:, 0], norms).clamp_(max=1.0)[:, None, None])
+        self._adam.step()
+
+    def _keep_going(self, log_ratios: torch.Tensor) -> bool:
+        """Stop members whose policy is farther from the one that acted than 1.5 `target_kl`."""
+        self._adam.active *= ~(_divergence(log_ratios) > self._limits)
+        self._active = [bool(active) for active in self._adam.active.tolist()]
+        return any(self._active)
+
+
+def _divergence(log_ratios: torch.Tensor) -> torch.Tensor:
+    """Schulman's estimate of the reverse KL divergence: the mean of (r - 1) - log r."""
+    return torch.expm1(log_ratios).sub_(log_ratios).mean(-1)
+
+
+class Gaussian:
+    """Independent normal actions; means are the actor's outputs, log_std a parameter of its own."""
+
+    def __init__(self, stack: Stack, means: torch.Tensor, gradients: torch.Tensor) -> None:
+        place, self._dimensions = stack.layout.log_std, stack.shape.outputs
+        width = rounded_up(self._dimensions, 16)
+        self._means, self._gradients = means, gradients
+        self._wide = stack.weights[:, ACTOR, :width]  # whole vectors
+        self._log_std, self._log_std_gradient = place.of(stack.weights)[:, ACTOR], place.of(stack.gradient)[:, ACTOR]
+
+    def log_prob(self, actions: torch.Tensor, offset: torch.Tensor, out: torch.Tensor) -> None:
+        """`(P, n, rows), (P, rows) -> (P, rows)` log-probabilities plus `offset`, into `out`."""
+        self._inverse = torch.exp(-self._wide)[:, : self._dimensions, None]
+        self._z = torch.sub(actions, self._means).mul_(self._inverse)
+        self._total = self._log_std.sum(1, keepdim=True).add_(0.5 * LOG_2PI * self._dimensions)
+        torch.sub(offset - self._total, self._z.square().sum(1), alpha=0.5, out=out)
+
+    def entropy(self, out: torch.Tensor) -> None:
+        """The mean entropy of each member's last `log_prob`, into `out` (P,)."""
+        torch.add(self._total[:, 0], 0.5 * self._dimensions, out=out)
+
+    def backward(self, pull: torch.Tensor, entropy: torch.Tensor) -> None:
+        """Gradients of sum(pull * log-probabilities) and the entropy loss times (P, 1) `entropy`; `pull`: (P, rows)."""
+        weighted = self._z * pull[:, None]
+        torch.mul(weighted, self._inverse, out=self._gradients)
+        curvature = weighted.mul_(self._z).sum(2)
+        torch.sub(curvature, pull.sum(1, keepdim=True).add_(entropy), out=self._log_std_gradient)
+
+
+class Categorical:
+    """Discrete actions; the actor's outputs are logits."""
+
+    def __init__(self, logits: torch.Tensor, gradients: torch.Tensor, size: int) -> None:
+        self._logits, self._gradients, self._size = logits, gradients, size
+
+    def log_prob(self, actions: torch.Tensor, offset: torch.Tensor, out: torch.Tensor) -> None:
+        """As `Gaussian.log_prob`; actions (P, 1, rows)."""
+        self._actions = actions
+        self._log_probs = torch.log_softmax(self._logits, dim=1)
+        self._probs = torch.exp(self._log_probs)
+        torch.add(self._log_probs.gather(1, actions)[:, 0], offset, out=out)
+
+    def entropy(self, out: torch.Tensor) -> None:
+        """As `Gaussian.entropy`."""
+        self._entropies = (self._probs * self._log_probs).sum(1, keepdim=True).neg_()
+        torch.mean(self._entropies[:, 0, : self._size], dim=1, out=out)
+
+    def backward(self, pull: torch.Tensor, entropy: torch.Tensor) -> None:
+        """As `Gaussian.backward`."""
+        bonus = (self._log_probs + self._entropies).mul_(entropy[:, :, None] / self._size)
+        bonus.sub_(pull[:, None]).mul_(self._probs)
+        bonus.scatter_add_(1, self._actions, pull[:, None])
+        self._gradients.copy_(bonus)
+        self._gradients[:, :, self._size :] = 0.0
+
+
+def head_of(stack: Stack, outputs: torch.Tensor, gradients: torch.Tensor, size: int) -> Gaussian | Categorical:
+    """The distribution of actions, given the (P, n, rows) outputs of actors, of which `size` rows count."""
+    return Categorical(outputs, gradients, size) if stack.shape.discrete else Gaussian(stack, outputs, gradients)
+
+
+class Adam:
+    """torch's Adam with a learning rate for each member; members may sit a step out."""
+
+    def __init__(self, stack: Stack, learning_rates: Sequence[float]) -> None:
+        self._stack, self._rates = stack, learning_rates
+        self._rows: list[tuple[list[torch.Tensor], ...]] = [
+            ([stack.weights[p]], [stack.gradient[p]], [stack.exp_avg[p]], [stack.exp_avg_sq[p]], [], [stack.steps[p]])
+            for p in range(stack.members)
+        ]
+        self._columns = torch.tensor(learning_rates, dtype=torch.float64, device=stack.device)
+        self.active = torch.ones(stack.members, device=stack.device)
+
+    def step(self) -> None:
+        """One step of every member whose `active` is 1; the others keep all they have."""
+        self._stack.steps.add_(self.active)
+        if self._stack.device.type == "cpu":
+            self._row_by_row()
+        else:
+            self._together()
+
+    def _row_by_row(self) -> None:
+        for row, rate, active in zip(self._rows, self._rates, self.active.tolist(), strict=True):
+            if active:
+                torch._fused_adam_(
+                    *row, lr=rate, beta1=BETAS[0], beta2=BETAS[1], weight_decay=0.0, eps=EPS,
+                    amsgrad=False, maximize=False,
+                )  # fmt: skip
+
+    def _together(self) -> None:
+        """Without a kernel for each member: for devices where starting one is what costs."""
+        stack, active = self._stack, self.active[:, None, None]
+        gradient = torch.where(active > 0.0, stack.gradient, 0.0)
+        stack.exp_avg.lerp_(gradient, (1.0 - BETAS[0]) * active.to(stack.dtype))
+        stack.exp_avg_sq.lerp_(gradient.square_(), (1.0 - BETAS[1]) * active.to(stack.dtype))
+        first, second = (1.0 - beta ** stack.steps.double().clamp(min=1.0) for beta in BETAS)
+        rates, roots = (self._columns * self.active / first).to(stack.dtype), second.sqrt().to(stack.dtype)
+        denominators = stack.exp_avg_sq.sqrt().div_(roots[:, None, None]).add_(EPS)
+        stack.weights.sub_(stack.exp_avg.div(denominators).mul_(rates[:, None, None]))
+
+
+def split(tensor: torch.Tensor, axis: int, shape: tuple[int, ...]) -> torch.Tensor:
+    """A view with one axis as several."""
+    view: torch.Tensor = tensor.unflatten(axis, shape)  # type: ignore[no-untyped-call]
+    return view
+
+
+def rounded_up(number: int, multiple: int) -> int:
+    """The least multiple that is not less."""
+    return -(-number // multiple) * multiple

@@ -1,0 +1,216 @@
+"""Many runs of one shape in one process, side by side: collected, measured and updated together.
+
+Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a course (`member`) that says
+what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch of
+environments, and once every member waits for its update, all are made in one tensor program. A member's bits do not
+depend on its companions, so members may be put together in any way, end when they end, and be resumed among others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from space_dist.cluster import Handle, InProcess
+from space_dist.config import RunConfig
+from space_dist.envs import BatchedEnv
+from space_dist.envs.interface import Closable
+from space_dist.errors import SpaceDistError
+from space_dist.interrupts import StopRequests
+from space_dist.launch import Outcome, begun, speaking
+from space_dist.learner import PopulationLearner, learn_together
+from space_dist.rollout import Outcomes, Rollout, Setup, Split, Trial, Walk, collect, evaluate
+from space_dist.training import Learn, Wait, Work
+
+_SLOTS = 1024  # environments stepped together, at most: what the cache holds of them. Decides no result
+_KEPT = 4  # batches of environments that are kept
+
+
+def member(config: RunConfig, folder: Path, *, stop: StopRequests) -> Work[Outcome]:
+    """One run of a population, to its end or from where it stopped; raises as `launch` does."""
+    with begun(config, folder, resume=True, stop=StopRequests(stop)) as course:
+        if not course.outcome.already_done:
+            yield from course.training(_Promising(config, course.setup)).work()
+    return course.finished()
+
+
+def advance(
+    members: Mapping[Path, Work[Outcome]], ended: Callable[[Path, Outcome | SpaceDistError], None]
+) -> None:  # fmt: skip
+    """Bring all members to their ends; `ended` hears of each when it has come to it, and how.
+
+    members: by the folder of their run. A member that fails, or is asked to stop, ends alone.
+    """
+    shop, asked = _Workshop(), dict[Path, Wait | Learn]()
+
+    def go_on(folder: Path, answer: Any) -> None:
+        token = speaking.set(folder)
+        work = members[folder]
+        try:
+            asked[folder] = work.throw(answer) if isinstance(answer, Exception) else work.send(answer)
+        except StopIteration as stop:
+            ended(folder, stop.value)
+        except SpaceDistError as error:
+            ended(folder, error)
+        finally:
+            speaking.reset(token)
+
+    try:
+        for folder in members:
+            go_on(folder, None)
+        while asked:
+            waiting = {folder: request for folder, request in asked.items() if isinstance(request, Wait)}
+            answers = shop.answers(waiting) if waiting else _learned(asked)
+            for folder, answer in answers.items():
+                del asked[folder]
+                go_on(folder, answer)
+    finally:
+        shop.close()
+        for work in members.values():
+            work.close()
+
+
+def _learned(asked: Mapping[Path, Wait | Learn]) -> dict[Path, Any]:
+    """The updates of all members, or what became of them."""
+    requests = {folder: request for folder, request in asked.items() if isinstance(request, Learn)}
+    stacks: dict[Hashable, list[Path]] = defaultdict(list)
+    for folder, request in requests.items():
+        if not isinstance(request.learner, PopulationLearner):
+            raise TypeError(f"{folder}: a member of a population needs engine: population")
+        stacks[request.learner.key].append(folder)
+    answers: dict[Path, Any] = {}
+    for folders in stacks.values():
+        stack = [requests[folder] for folder in folders]
+        updates = learn_together(
+            [request.learner for request in stack if isinstance(request.learner, PopulationLearner)],
+            [request.shards for request in stack],
+            round=[request.round for request in stack], steps=[request.steps for request in stack],
+        )  # fmt: skip
+        answers |= dict(zip(folders, updates, strict=True))
+    return answers
+
+
+@dataclass(eq=False)
+class _Promise:
+    """A handle: shards or outcomes that a member waits for. value: once it is known; an exception where it failed."""
+
+    setup: Setup
+    work: Rollout | Trial
+    value: Any = None
+
+    @property
+    def batch(self) -> Hashable:
+        """Equal for what can be computed at once."""
+        setup = self.setup
+        env = (setup.env_id, json.dumps(dict(setup.env_kwargs), sort_keys=True), setup.context_visible)
+        if isinstance(self.work, Rollout):
+            return ("collect", *env, setup.slots, setup.slot_length)
+        return ("measure", *env, len(self.work), self.work.random is None)
+
+    @property
+    def slots(self) -> int:
+        """Environments that it takes."""
+        return self.setup.slots if isinstance(self.work, Rollout) else len(self.work)
+
+
+class _Promising(InProcess):
+    """A member's cluster: what is large is promised, and computed with its like; the rest is done at once."""
+
+    def collect(
+        self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
+    ) -> list[Handle]:
+        """See `Cluster`."""
+        asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
+        return [_Promise(self._setup, self._setup.rollout(policy, selection, walk, shard=shard, **asked))
+                for shard in range(self._setup.shards)]  # fmt: skip
+
+    def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
+        """See `Cluster`."""
+        trials = [self._setup.trial(policy, split, part, stochastic=stochastic)
+                  for part in range(self._setup.evaluation_parts)]  # fmt: skip
+        return [_Promise(self._setup, trial) if len(trial) else Outcomes.none(policy.version) for trial in trials]
+
+
+class _Workshop:
+    """Computes what members were promised, in batches over all of them."""
+
+    def __init__(self) -> None:
+        self._envs: dict[Hashable, BatchedEnv] = {}
+
+    def answers(self, waiting: Mapping[Path, Wait]) -> dict[Path, Any]:
+        """The values that each member waits for; an exception for one whose work failed."""
+        handles = [handle for request in waiting.values() for handle in request.handles]
+        self._keep([handle for handle in handles if isinstance(handle, _Promise) and handle.value is None])
+        answers: dict[Path, Any] = {}
+        for folder, request in waiting.items():
+            values = [handle.value if isinstance(handle, _Promise) else handle for handle in request.handles]
+            answers[folder] = next((value for value in values if isinstance(value, Exception)), values)
+        return answers
+
+    def close(self) -> None:
+        """Free the environments."""
+        while self._envs:
+            self._forget(next(iter(self._envs)))
+
+    def _keep(self, promises: Sequence[_Promise]) -> None:
+        batches: dict[Hashable, list[_Promise]] = defaultdict(list)
+        for promise in promises:
+            batches[promise.batch].append(promise)
+        for batch, promised in batches.items():
+            for some in _parts(promised):
+                try:
+                    self._compute(batch, some)
+                except Exception:  # somebody's environment may raise anything: whose was it?
+                    self._compute_apart(batch, some)
+
+    def _compute(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
+        env = self._env(batch, promised)
+        setup, works = promised[0].setup, [promise.work for promise in promised]
+        rollouts = [work for work in works if isinstance(work, Rollout)]
+        values: Sequence[Any] = (
+            collect(env, rollouts, length=setup.slot_length) if rollouts
+            else evaluate(env, [work for work in works if isinstance(work, Trial)])
+        )  # fmt: skip
+        for promise, value in zip(promised, values, strict=True):
+            promise.value = value
+
+    def _compute_apart(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
+        for promise in promised:
+            self.close()  # nobody knows what state an environment is in that has failed
+            if isinstance(promise.work, Trial) and promise.work.random is not None:
+                promise.value = SpaceDistError("the environment failed while episodes were measured")
+                continue
+            try:
+                self._compute(batch, [promise])
+            except Exception as error:
+                promise.value = error
+        self.close()
+
+    def _env(self, batch: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:
+        slots = sum(promise.slots for promise in promised)
+        key = (batch, slots)
+        if key not in self._envs:
+            while len(self._envs) >= _KEPT:
+                self._forget(next(iter(self._envs)))
+            self._envs[key] = promised[0].setup.make_env(slots)
+        return self._envs[key]
+
+    def _forget(self, key: Hashable) -> None:
+        env = self._envs.pop(key)
+        if isinstance(env, Closable):
+            with contextlib.suppress(Exception):
+                env.close()
+
+
+def _parts(promised: Sequence[_Promise]) -> Iterator[Sequence[_Promise]]:
+    """Equal parts that fit the cache."""
+    count = -(-sum(promise.slots for promise in promised) // _SLOTS)
+    for places in np.array_split(np.arange(len(promised)), min(count, len(promised))):
+        yield [promised[place] for place in places]
