@@ -464,6 +464,15 @@ class PPOConfig(_OnPolicy):
     """Largest norm of the gradient; null: no clipping (the paper, appendix A). Source of the default: SB3."""
     target_kl: float | None = Field(default=None, gt=0.0)
     """Stop an update's epochs early at 1.5 times this divergence; null: never. Source: SB3."""
+    update: Literal["stock", "lean"] = "stock"
+    """stock: SB3's own train(). lean: the same minibatches, loss and optimiser with derivatives written out, several
+    times faster where networks are small, equal but for rounding; MlpPolicy only. Part of what a run is."""
+
+    @model_validator(mode="after")
+    def _lean_knows_mlps_only(self) -> Self:
+        if self.update == "lean" and self.policy != "MlpPolicy":
+            raise ValueError(f"update: lean knows MlpPolicy only, not {self.policy}; allowed with it: stock")
+        return self
 
 
 class TRPOConfig(_OnPolicy):

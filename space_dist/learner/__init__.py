@@ -1,7 +1,8 @@
 """The Stable-Baselines3 adapter: networks, updates, and what a checkpoint must hold of them.
 
 Nothing of SB3 is written twice: what shards collected is put into SB3's own buffers, and SB3's own `train()` learns
-from it. What SB3 does outside `train()` while it collects is done here, per transition.
+from it. What SB3 does outside `train()` while it collects is done here, per transition. `lean` is the exception, on
+request: PPO's `train()` for small networks, held against SB3's in tests.
 """
 
 from __future__ import annotations

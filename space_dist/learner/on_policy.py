@@ -17,13 +17,14 @@ from space_dist.config import A2CConfig, PPOConfig, TRPOConfig
 from space_dist.envs import Observations
 from space_dist.envs.observations import concatenate, each, put, rows
 from space_dist.learner.interface import Learner, schedule
+from space_dist.learner.lean import LeanPPO
 from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs, tensors
 from space_dist.policy import Head, MlpPolicy, Statistics
 from space_dist.rollout import Shard
 
 _OURS = {
     "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation", "log_std_init",
-    "normalize_observations", "normalize_rewards",
+    "normalize_observations", "normalize_rewards", "update",
 }  # fmt: skip
 
 
@@ -62,7 +63,9 @@ class OnPolicyLearner(Learner):
         settings = {name: value for name, value in dict(config).items() if name not in _OURS}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
             settings["max_grad_norm"] = float("inf")
-        model: Any = ALGORITHMS[config.kind](
+        lean = isinstance(config, PPOConfig) and config.update == "lean"
+        algorithm: Any = LeanPPO if lean else ALGORITHMS[config.kind]
+        model = algorithm(
             policy_class(config),
             env=None,
             n_steps=self._slot_length,

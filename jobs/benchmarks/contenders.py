@@ -1,0 +1,344 @@
+"""The contenders of `throughput`, each in a process of its own: `python -m benchmarks.contenders SPECIFICATION`.
+
+All of them train PPO with actor and critic of 64-64 tanh units, 10 epochs and the same settings on the same environment
+with its context visible. Times are wall times of whole iterations, collecting and learning, after two to warm up.
+"""
+
+from __future__ import annotations
+
+import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
+
+import itertools
+import json
+import logging
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from space_dist import config as configs
+from space_dist.config import PPOConfig
+from space_dist.envs import BatchedEnv, ContextObservation, make_batched, make_single
+from space_dist.errors import Interrupted
+from space_dist.instances import ContextBounds, read_csv
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch, private_ray
+from space_dist.ledger import Ledger
+from space_dist.training import Progress
+
+ROOT = Path(__file__).resolve().parents[2]
+WARM_UP = 2  # iterations
+EPOCHS = 10
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is learnt.
+
+    n_steps, batch_size: transitions per update and minibatch.  shards, slots: how ours collects them.
+    """
+
+    title: str
+    config: str
+    n_steps: int
+    batch_size: int
+    shards: int
+    slots: int
+    overrides: tuple[str, ...] = ()
+
+    def run_config(self, *more: str) -> configs.RunConfig:
+        """Our run: the curriculum, the ledger and checkpoints as always; evaluation at its ends alone."""
+        return configs.load(
+            ROOT / "configs" / self.config,
+            [
+                *self.overrides, f"learner.n_steps={self.n_steps}", f"learner.batch_size={self.batch_size}",
+                f"learner.n_epochs={EPOCHS}", f"rollout.shards={self.shards}", f"rollout.slots={self.slots}",
+                "budget.steps=1000000000", "evaluation.every_steps=1000000000", "tracking.uri=null", *more,
+            ],
+        )  # fmt: skip
+
+
+def _instances(name: str) -> list[str]:
+    return [f"instances.{split}={ROOT}/configs/instances/{name}_{split}.csv" for split in ("train", "test")]
+
+
+TASKS = {
+    "pointmass": Task("PointMass, 2,048 / 64", "pointmass_space.yaml", 2048, 64, 1, 16),
+    "pointmass_large": Task("PointMass, 8,192 / 1,024", "pointmass_space.yaml", 8192, 1024, 1, 64),
+    "cartpole": Task("CartPole, 2,048 / 64", "pointmass_space.yaml", 2048, 64, 1, 8,
+                     ("env.id=space_dist/CartPole-v0", *_instances("cartpole_uniform"))),
+    "ant": Task("AntGoal, 2,048 / 64", "antgoal_space.yaml", 2048, 64, 4, 1),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Who learns, and how it is set up.
+
+    kind: ours, sb3 or rllib.  threads: of torch in the learning process.
+    update, workers, overrides: of ours.  vec_env, n_envs: SB3's dummy or subproc, or batched, ours in its interface.
+    runners, n_envs: RLlib's processes and the environments of each.
+    """
+
+    kind: str
+    threads: int = 1
+    update: str = "stock"
+    workers: int = 0
+    overrides: tuple[str, ...] = ()
+    vec_env: str = "subproc"
+    n_envs: int = 2
+    runners: int = 0
+
+    @property
+    def title(self) -> str:
+        """In tables."""
+        if self.kind == "ours":
+            return f"ours, {self.update}"
+        if self.kind == "rllib":
+            return "RLlib"
+        names = {"subproc": "SubprocVecEnv", "dummy": "DummyVecEnv", "batched": "our batched environment"}
+        return f"SB3, {names[self.vec_env]}({self.n_envs})"
+
+    @property
+    def setting(self) -> str:
+        """What was chosen for it."""
+        threads = f"{self.threads} torch thread{'s' if self.threads > 1 else ''}"
+        if self.kind == "ours":
+            return f"{self.workers} Ray actors" if self.workers else "one process"
+        if self.kind == "rllib":
+            return f"{self.runners} env runners of {self.n_envs}, {threads}"
+        return threads
+
+
+class _Stopwatch:
+    """Marks the ends of iterations, until there are enough."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._marks: list[tuple[int, float]] = []
+
+    def mark(self, steps: int) -> bool:
+        """At so many steps of the run. Whether that is enough: an iteration at least, and the time asked for."""
+        self._marks.append((steps, time.perf_counter()))
+        return len(self._marks) > WARM_UP + 1 and self._marks[-1][1] - self._marks[WARM_UP][1] >= self._seconds
+
+    def rate(self) -> float:
+        """Environment steps per second."""
+        (first, start), (last, end) = self._marks[WARM_UP], self._marks[-1]
+        return (last - first) / (end - start)
+
+
+def measure(task: Task, contender: Contender, seconds: float) -> float:
+    """Environment steps per second of `contender` on `task`, over about `seconds`."""
+    import torch
+
+    watch = _Stopwatch(seconds)
+    if contender.kind == "rllib":
+        _rllib(task, contender, watch)
+        return watch.rate()
+    if contender.kind == "ours":
+        _ours(task, contender, watch)
+        return watch.rate()
+    torch.set_num_threads(contender.threads)
+    _sb3(task, contender, watch)
+    return watch.rate()
+
+
+def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    config = task.run_config(
+        f"learner.update={contender.update}", f"resources.workers={contender.workers}", *contender.overrides
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        run, seen = Path(folder) / "run", [-1]
+
+        def observe(progress: Progress) -> None:
+            if progress.steps > seen[0]:
+                seen[0] = progress.steps
+                if watch.mark(progress.steps):
+                    Ledger(run).stop_file.touch()
+
+        try:
+            launch(config, run, resume=False, stop=StopRequests(), observe=observe)
+        except Interrupted:
+            return
+        raise RuntimeError("the run ended before it was measured")
+
+
+def _single(config: configs.RunConfig) -> Callable[[], gym.Env[Any, Any]]:
+    """The registered Gymnasium environment, which draws a context at each reset, with that context in its observations.
+
+    Without Gymnasium's checkers around it, which cost rivals time.
+    """
+    return lambda: ContextObservation(make_single(config.env.id, **config.env.kwargs))
+
+
+def _sb3(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+    class Marks(BaseCallback):
+        enough = False
+
+        def _on_rollout_start(self) -> None:
+            self.enough = watch.mark(self.num_timesteps)
+
+        def _on_step(self) -> bool:
+            return not self.enough
+
+    config, settings = _settings(task)
+    n_envs = contender.n_envs
+    if contender.vec_env == "batched":
+        from benchmarks.batched_vec_env import BatchedVecEnv
+
+        bounds = make_batched(config.env.id, 1, context_visible=False, kwargs=config.env.kwargs).context_bounds
+        env: Any = BatchedVecEnv(_batched(config, n_envs), _contexts(config, bounds), seed=0)
+    else:
+        env = (SubprocVecEnv if contender.vec_env == "subproc" else DummyVecEnv)([_single(config)] * n_envs)
+        env.seed(0)
+    PPO(
+        "MlpPolicy", env, n_steps=task.n_steps // n_envs, batch_size=task.batch_size, n_epochs=EPOCHS, device="cpu",
+        gamma=settings.gamma, gae_lambda=settings.gae_lambda, learning_rate=settings.learning_rate,
+        ent_coef=settings.ent_coef, vf_coef=settings.vf_coef, clip_range=settings.clip_range, seed=0,
+        policy_kwargs={"net_arch": list(settings.net_arch)},
+    ).learn(10**9, callback=Marks())  # fmt: skip
+    env.close()
+
+
+def _settings(task: Task) -> tuple[configs.RunConfig, PPOConfig]:
+    config = task.run_config()
+    if not isinstance(config.learner, PPOConfig):
+        raise TypeError(f"{task.config} trains no PPO")
+    return config, config.learner
+
+
+def _batched(config: configs.RunConfig, n_slots: int) -> BatchedEnv:
+    return make_batched(config.env.id, n_slots, context_visible=True, kwargs=config.env.kwargs)
+
+
+def _contexts(config: configs.RunConfig, bounds: ContextBounds) -> NDArray[np.float64]:
+    return read_csv(config.instances.train, bounds).contexts
+
+
+def _rllib(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    private_ray()
+    import ray
+    from ray.rllib.algorithms import ppo
+    from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+    from ray.tune.registry import register_env
+
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    config, settings = _settings(task)
+    make, rllib_ppo = _single(config), cast(Any, ppo)  # which is untyped
+    ray.init(
+        address="local", num_cpus=contender.runners + 1, include_dashboard=False, log_to_driver=False,
+        logging_level=logging.ERROR,
+    )  # fmt: skip
+    register_env("task", lambda _: make())
+    algorithm = (
+        rllib_ppo.PPOConfig()
+        .environment("task")
+        .env_runners(num_env_runners=contender.runners, num_envs_per_env_runner=contender.n_envs)
+        .learners(num_learners=0)
+        .training(
+            train_batch_size_per_learner=task.n_steps, minibatch_size=task.batch_size, num_epochs=EPOCHS,
+            lr=settings.learning_rate, gamma=settings.gamma, lambda_=settings.gae_lambda, grad_clip=0.5,
+            clip_param=settings.clip_range, vf_clip_param=math.inf, vf_loss_coeff=settings.vf_coef,
+            entropy_coeff=settings.ent_coef, use_kl_loss=False,
+        )
+        .rl_module(
+            model_config=DefaultModelConfig(
+                fcnet_hiddens=list(settings.net_arch), fcnet_activation="tanh", vf_share_layers=False
+            )
+        )
+        .debugging(log_level="ERROR", seed=0)
+        .build_algo()
+    )  # fmt: skip
+    enough = watch.mark(0)
+    while not enough:
+        enough = watch.mark(int(algorithm.train()["num_env_steps_sampled_lifetime"]))
+    algorithm.stop()
+    ray.shutdown()
+
+
+def limits(task: Task) -> dict[str, float]:
+    """What no contender can avoid, of one core: seconds of arithmetic and of the environment's own steps.
+
+    single, batched: seconds per environment step, alone and among ours.  arithmetic: seconds per environment step for
+    the networks' multiplications, when acting and in all epochs, at the rate of a large matrix product.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    config, settings = _settings(task)
+    one, many = _single(config)(), _batched(config, task.slots)
+    found = {"single": _single_seconds(one), "batched": _batched_seconds(many, config)}
+    inputs = int(np.prod(many.observation_space.shape or ()))
+    space = many.action_space
+    outputs = int(space.n) if isinstance(space, gym.spaces.Discrete) else int(np.prod(space.shape or ()))
+    widths = [inputs, *settings.net_arch]
+    products = 2 * sum(a * b for a, b in itertools.pairwise(widths)) + widths[-1] * (outputs + 1)
+    # Forward; backward, by weights and by inputs, of which the first layer needs none.
+    learning = EPOCHS * (3 * products - 2 * widths[0] * widths[1])
+    matrix = torch.ones(512, 512)
+    start, count = time.perf_counter(), 0
+    while time.perf_counter() - start < 0.5:
+        matrix @ matrix
+        count += 1
+    per_product = (time.perf_counter() - start) / (count * 512**3)
+    return found | {"arithmetic": (products + learning) * per_product}
+
+
+def _single_seconds(env: gym.Env[Any, Any], steps: int = 2_000) -> float:
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    start = time.perf_counter()
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+    return (time.perf_counter() - start) / steps
+
+
+def _batched_seconds(env: BatchedEnv, config: configs.RunConfig, steps: int = 1_000) -> float:
+    space, slots = env.action_space, np.arange(env.n_slots)
+    space.seed(0)
+    contexts = _contexts(config, env.context_bounds)
+    env.reset(slots, contexts[slots % len(contexts)], slots.astype(np.uint64))
+    actions = np.stack([space.sample() for _ in slots])
+    start = time.perf_counter()
+    for _ in range(steps):
+        step = env.step(actions)
+        ended = np.flatnonzero(step.terminated | step.truncated)
+        if len(ended):
+            env.reset(ended, contexts[ended % len(contexts)], ended.astype(np.uint64))
+    return (time.perf_counter() - start) / (steps * env.n_slots)
+
+
+def specification(task: str, contender: Contender | None, seconds: float) -> str:
+    """What a process of this module is given; without a contender it measures the limits."""
+    return json.dumps({"task": task, "contender": contender and asdict(contender), "seconds": seconds})
+
+
+def _main() -> None:
+    given = json.loads(sys.argv[1])
+    task = TASKS[given["task"]]
+    if given["contender"] is None:
+        found = limits(task)
+    else:
+        settings = given["contender"]
+        contender = Contender(**settings | {"overrides": tuple(settings["overrides"])})
+        found = {"rate": measure(task, contender, given["seconds"])}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    _main()

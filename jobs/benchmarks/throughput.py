@@ -1,0 +1,357 @@
+"""How fast PPO trains: ours beside Stable-Baselines3 and RLlib, interleaved, each rival with its best setting."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+from rich.console import Console
+
+from benchmarks.contenders import TASKS, Contender, specification
+from space_dist import config as configs
+from space_dist.errors import SpaceDistError
+from space_dist.ledger import Ledger
+
+ROOT = Path(__file__).resolve().parents[2]
+CORES = 2
+PATIENCE = 60.0  # seconds for a setting that is tried, its start included: one with too many threads may take hours
+PARTS = (*TASKS, "population", "table1")
+DUMMY, SUBPROCESSES, BATCHED = (4, 8, 16, 32), (2, 4, 8), (16, 64)  # environments that are tried for rivals
+RUNNERS = ((0, 1), (0, 8), (0, 32), (2, 1), (2, 8))  # RLlib's env runners, and environments of each
+MEMBERS: dict[str, list[Any]] = {"learner.learning_rate": [1e-4, 2e-4, 3e-4, 5e-4]}  # of a population, times 8 seeds
+TABLE1: dict[str, list[Any]] = {  # docs/grids.md
+    "curriculum.kappa": [1, 4, 16, 64], "curriculum.eta": [0.025, 0.05, 0.1, 0.2],
+}  # fmt: skip
+TABLE1_STEPS = 4 * 4 * 10 * 1e6
+# What is wanted at least, on two cores.
+WANTED = {
+    "lean_vs_subproc2": 3.0, "lean_vs_best_sb3": 1.5, "lean_vs_rllib": 3.0, "batched_vs_subproc2": 12.0,
+    "batched_vs_sb3_batched": 1.4, "ant_vs_subproc2": 1.7, "population_vs_best_sb3": 10.0,
+}  # fmt: skip
+PAIRS = {  # a ratio: the task, ours, and the rival
+    "lean_vs_subproc2": ("pointmass", "lean", "subproc2"),
+    "lean_vs_best_sb3": ("pointmass", "lean", "best_sb3"),
+    "lean_vs_rllib": ("pointmass", "lean", "rllib"),
+    "batched_vs_subproc2": ("pointmass_large", "lean", "subproc2"),
+    "batched_vs_sb3_batched": ("pointmass_large", "lean", "sb3_batched"),
+    "ant_vs_subproc2": ("ant", "lean", "subproc2"),
+    "population_vs_best_sb3": ("population", "population", "best_sb3"),
+}
+console = Console()
+
+
+@dataclass
+class Row:
+    """One line of the table.
+
+    measure: gives environment steps per second.  waits: seconds per environment step that no dispatch can save, by
+    cause.  rates: one per round.
+    """
+
+    title: str
+    setting: str
+    measure: Callable[[], float]
+    waits: dict[str, float]
+    rates: list[float] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        """Median over the rounds."""
+        return statistics.median(self.rates)
+
+    def limit(self) -> str:
+        """Where its time goes, as far as can be told: what is left is dispatch."""
+        shares = {cause: min(1.0, seconds * self.rate) for cause, seconds in self.waits.items()}
+        shares["dispatch"] = max(0.0, 1.0 - sum(shares.values()))
+        ordered = sorted(shares.items(), key=lambda item: -item[1])
+        return ", ".join(f"{cause} {share:.0%}" for cause, share in ordered)
+
+
+def throughput(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds, in each of which everybody is measured once.")] = 3,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Length of one measurement, start and warm-up apart.")] = 5.0,
+    only: Annotated[Optional[list[str]], typer.Option(help=f"Only these parts: {', '.join(PARTS)}.")] = None,  # noqa: UP045
+    member_steps: Annotated[int, typer.Option(min=2048, help="Steps of each of the 32 runs of a grid.")] = 102_400,
+    out: Annotated[Optional[Path], typer.Option(help="Folder for the table and the figure.")] = None,  # noqa: UP045
+    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+) -> None:
+    """Environment steps per second of PPO: ours (stock, lean, population) beside SB3 and RLlib."""
+    unknown = sorted({*(only or ())} - {*PARTS})
+    if unknown:
+        raise typer.BadParameter(f"{unknown[0]} is no part; allowed: {', '.join(PARTS)}", param_hint="--only")
+    parts = only or PARTS
+    table: dict[str, dict[str, Row]] = {name: _rows(name, seconds) for name in TASKS if name in parts}
+    if "population" in parts:
+        table["population"] = _population_rows(seconds, member_steps)
+    for number in range(rounds):
+        for name, rows in table.items():
+            for row in rows.values():
+                row.rates.append(row.measure())
+                console.print(f"round {number + 1}, {name}: {row.title}: {row.rates[-1]:,.0f} steps/s", markup=False)
+    ratios = {
+        name: _ratio(table[task][ours], table[task][rival])
+        for name, (task, ours, rival) in PAIRS.items()
+        if task in table and rival in table[task]
+    }
+    projected = _table1(member_steps) if "table1" in parts else {}
+    text = _markdown(table, ratios, projected, rounds)
+    console.print(text, markup=False)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "throughput.md").write_text(text)
+        _figure(table, out / "throughput.png")
+    if json_file is not None:
+        json_file.write_text(json.dumps(_numbers(table, ratios, projected), indent=1) + "\n")
+    short = [name for name, ratio in ratios.items() if ratio < WANTED[name]]
+    if short:
+        console.print(f"Less than wanted: {', '.join(short)}.", style="red")
+        raise typer.Exit(1)
+
+
+def _ratio(ours: Row, rival: Row) -> float:
+    """Median of the rounds' ratios: what slows the whole machine for a while slows both."""
+    return statistics.median(one / other for one, other in zip(ours.rates, rival.rates, strict=True))
+
+
+# ---- who is measured ----
+
+
+def _rows(task: str, seconds: float) -> dict[str, Row]:
+    """Everybody on one task, rivals with the settings that were fastest in a search."""
+    costs = _process(specification(task, None, 0.0))
+    subproc = [Contender("sb3", vec_env="subproc", n_envs=2, threads=threads) for threads in (1, CORES)]
+    stock = [
+        Contender("sb3", vec_env=kind, n_envs=n)
+        for kind, counts in (("subproc", SUBPROCESSES), ("dummy", DUMMY))
+        for n in counts
+    ]
+    found = {"subproc2": _best(task, subproc, seconds), "best_sb3": _best(task, stock, seconds)}
+    found["sb3_batched"] = _best(task, [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED], seconds)
+    for name in ("best_sb3", "sb3_batched"):
+        found[name] = _best(task, [found[name], replace(found[name], threads=CORES)], seconds)
+    if _rllib_installed():
+        found["rllib"] = _best(task, [Contender("rllib", runners=r, n_envs=n) for r, n in RUNNERS], seconds)
+    workers = CORES if TASKS[task].shards > 1 else 0
+    found |= {update: Contender("ours", update=update, workers=workers) for update in ("stock", "lean")}
+    return {
+        name: Row(
+            contender.title, contender.setting, lambda contender=contender: _rate(task, contender, seconds),  # type: ignore[misc]
+            _waits(contender, costs),
+        )
+        for name, contender in found.items()
+    }  # fmt: skip
+
+
+def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
+    """The fastest in one short measurement each; one that does not get it done in a minute is none."""
+    rates = {contender: _rate(task, contender, seconds / 2.0, patience=PATIENCE) for contender in contenders}
+    for contender, rate in rates.items():
+        console.print(
+            f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s", style="dim", markup=False
+        )
+    return max(rates, key=lambda contender: rates[contender])
+
+
+def _waits(contender: Contender, costs: dict[str, float]) -> dict[str, float]:
+    """Seconds per environment step of the simulator and of arithmetic, as far as they cannot run side by side."""
+    batched = contender.kind == "ours" or contender.vec_env == "batched"
+    processes = {"ours": contender.workers, "rllib": contender.runners}.get(
+        contender.kind, contender.n_envs if contender.vec_env == "subproc" else 1
+    )
+    simulator = costs["batched" if batched and contender.kind != "rllib" else "single"] / min(CORES, max(1, processes))
+    return {"simulator": simulator, "arithmetic": costs["arithmetic"] / contender.threads}
+
+
+def _population_rows(seconds: float, member_steps: int) -> dict[str, Row]:
+    """A grid of 32 runs by populations, beside SB3 with two processes at a time."""
+    costs = _process(specification("pointmass", None, 0.0))
+    rivals = {
+        "best_sb3": [Contender("sb3", vec_env="dummy", n_envs=n) for n in DUMMY],
+        "sb3_batched": [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED],
+    }
+    halves = {"simulator": costs["batched"] / CORES, "arithmetic": costs["arithmetic"] / CORES}
+    rows = {}
+    for name, contenders in rivals.items():
+        best = _best("pointmass", contenders, seconds)
+        rows[name] = Row(
+            f"{best.title}, {CORES} processes at a time", best.setting,
+            lambda best=best: _rate("pointmass", best, seconds, processes=CORES),  # type: ignore[misc]
+            {cause: wait / CORES for cause, wait in _waits(best, costs).items()},
+        )  # fmt: skip
+    rows["population"] = Row(
+        "ours, population: a grid of 32 runs", "whole wall time: start, evaluation, ledgers and checkpoints included",
+        lambda: 32 * _whole_updates(member_steps) / _grid_seconds(member_steps, MEMBERS, 8, {}), halves,
+    )  # fmt: skip
+    return rows
+
+
+# ---- how it is measured ----
+
+
+def _rate(
+    task: str, contender: Contender, seconds: float, *, processes: int = 1, patience: float | None = None
+) -> float:
+    """Steps per second of so many processes at once, together; 0 if they take longer than `patience` seconds."""
+    wanted = specification(task, contender, seconds)
+    running = [_start(wanted) for _ in range(processes)]
+    try:
+        return sum(_finish(process, wanted, patience)["rate"] for process in running)
+    except subprocess.TimeoutExpired:
+        return 0.0
+    finally:
+        for process in running:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+def _process(wanted: str) -> dict[str, float]:
+    return _finish(_start(wanted), wanted)
+
+
+def _start(wanted: str) -> subprocess.Popen[str]:
+    # OpenMP's threads are what torch's contenders set themselves; everything else keeps to one.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "jobs")])}
+    environment |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-m", "benchmarks.contenders", wanted],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True,
+    )  # fmt: skip
+
+
+def _finish(process: subprocess.Popen[str], wanted: str, patience: float | None = None) -> dict[str, float]:
+    output, errors = process.communicate(timeout=patience)
+    if process.returncode:
+        raise SpaceDistError(f"a contender failed: {wanted}: {errors[-2000:]}")
+    found: dict[str, float] = json.loads(output.splitlines()[-1])
+    return found
+
+
+def _rllib_installed() -> bool:
+    """Whether RLlib can be imported: Ray ships it, without what it needs (the extra `bench`)."""
+    tried = subprocess.run([sys.executable, "-c", "import ray.rllib.algorithms.ppo"], capture_output=True, check=False)
+    return tried.returncode == 0
+
+
+def _whole_updates(steps: int) -> int:
+    return steps // 2048 * 2048
+
+
+def _grid_seconds(member_steps: int, axes: Mapping[str, list[Any]], seeds: int, more: dict[str, Any]) -> float:
+    """Wall time of `space-dist grid run` with populations, all runs of which must have come to their end."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = folder / "grid.yaml"
+        path.write_text(configs.to_yaml({
+            "name": "throughput", "extends": str(ROOT / "configs/pointmass_space.yaml"),
+            "set": {"engine": "population", "budget.steps": member_steps, **more},
+            "grid": dict(axes), "seeds": {"count": seeds}, "tracking": {"uri": None},
+        }))  # fmt: skip
+        command = [sys.executable, "-m", "space_dist.cli", "grid", "run", str(path), "--root", str(folder / "runs")]
+        start = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        seconds = time.perf_counter() - start
+        if done.returncode:
+            raise SpaceDistError(f"the grid did not complete: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+        statuses = [Ledger(file.parent).status() for file in (folder / "runs").rglob("status.json")]
+        steps = [status.steps for status in statuses if status.state == "done"]
+        if sorted(steps) != [_whole_updates(member_steps)] * 32:
+            raise SpaceDistError(f"not all 32 runs came to their end: {sorted(steps)}")
+    return seconds
+
+
+def _table1(member_steps: int) -> dict[str, float]:
+    """Hours that the paper's Table 1 would take, by learner, from a slice of 32 of its 160 runs."""
+    trpo = {"learner": {"kind": "trpo", "n_steps": 2048, "gamma": 0.95, "gae_lambda": 0.99, "target_kl": 0.004}}
+    hours = {}
+    learners: dict[str, dict[str, Any]] = {"ppo": {}, "trpo": trpo}
+    for learner, more in learners.items():
+        seconds = _grid_seconds(member_steps, TABLE1, 2, more)
+        hours[learner] = seconds * TABLE1_STEPS / (32 * _whole_updates(member_steps)) / 3600.0
+        console.print(f"table 1, {learner}: {seconds:.1f} s for 32 runs, projected {hours[learner]:.2f} h")
+    return hours
+
+
+# ---- what is shown ----
+
+
+def _title(part: str) -> str:
+    return TASKS[part].title if part in TASKS else "PointMass, 2,048 / 64: grids on both cores"
+
+
+def _markdown(
+    table: dict[str, dict[str, Row]], ratios: dict[str, float], projected: dict[str, float], rounds: int
+) -> str:
+    lines = [
+        f"Environment steps per second: medians of {rounds} interleaved rounds (least and most), and ratios to the "
+        "first line. Where the time goes: the environment's own steps and the networks' multiplications, as measured "
+        "alone; all else is dispatch (Python, autograd, interprocess communication).",
+        "",
+    ]
+    for part, rows in table.items():
+        first = next(iter(rows.values()))
+        lines += [f"**{_title(part)}**", "", "| | setting | steps/s | ratio | where the time goes |",
+                  "|---|---|---:|---:|---|"]  # fmt: skip
+        for row in rows.values():
+            span = f"{row.rate:,.0f} ({min(row.rates):,.0f}-{max(row.rates):,.0f})"
+            lines.append(f"| {row.title} | {row.setting} | {span} | {_ratio(row, first):.1f} | {row.limit()} |")
+        if part in TASKS and "rllib" not in rows:
+            lines.append("| RLlib | not installed (extra `bench`) | | | |")
+        lines.append("")
+    if ratios:
+        lines += ["| ratio | measured | wanted at least |", "|---|---:|---:|"]
+        lines += [f"| `{name}` | {ratio:.2f} | {WANTED[name]:g} |" for name, ratio in ratios.items()]
+        lines.append("")
+    for learner, hours in projected.items():
+        lines.append(f"The paper's Table 1 (4 x 4 x 10 runs of 1e6 steps) with {learner.upper()}: {hours:.2f} hours.")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _figure(table: dict[str, dict[str, Row]], file: Path) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    heights = [len(rows) for rows in table.values()]
+    figure, axes = plt.subplots(
+        len(table), 1, figsize=(9.0, 1.0 + 0.42 * sum(heights) + 0.5 * len(heights)), height_ratios=heights,
+        squeeze=False, layout="constrained",
+    )  # fmt: skip
+    for axis, (part, rows) in zip(axes[:, 0], table.items(), strict=True):
+        shown = list(rows.values())
+        colours = ["tab:blue" if row.title.startswith("ours") else "tab:grey" for row in shown]
+        errors = [[row.rate - min(row.rates) for row in shown], [max(row.rates) - row.rate for row in shown]]
+        axis.barh([row.title for row in shown], [row.rate for row in shown], xerr=errors, color=colours, capsize=2)
+        axis.invert_yaxis()
+        axis.set_title(_title(part), fontsize=10, loc="left")
+        for position, row in enumerate(shown):
+            axis.text(max(row.rates), position, f"  {row.rate:,.0f}", va="center", fontsize=8)
+        axis.margins(x=0.15)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[-1, 0].set_xlabel("environment steps per second, collecting and learning; median, least and most")
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
+
+
+def _numbers(table: dict[str, dict[str, Row]], ratios: dict[str, float], projected: dict[str, float]) -> dict[str, Any]:
+    return {
+        "ratios": ratios,
+        "table1_hours": projected,
+        "rates": {part: {name: row.rates for name, row in rows.items()} for part, rows in table.items()},
+        "settings": {
+            part: {name: f"{row.title}; {row.setting}" for name, row in rows.items()} for part, rows in table.items()
+        },
+        "waits": {part: {name: row.waits for name, row in rows.items()} for part, rows in table.items()},
+    }

@@ -1,0 +1,280 @@
+"""`learner.update: lean` against Stable-Baselines3's own `train()`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from space_dist import config as configs
+from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.learner import lean, make_learner
+from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
+from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
+
+UPDATES = 20
+
+
+class Casting(BaseFeaturesExtractor):
+    """Flat observations in double: makes SB3's policy a double one."""
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space, features_dim=int(np.prod(observation_space.shape)))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return observations.flatten(1).double()
+
+
+def doubled(learner: Any) -> Any:
+    """The same learner, its networks and optimiser double."""
+    policy = learner.model.policy
+    casting = Casting(learner.model.observation_space)
+    policy.features_extractor = policy.pi_features_extractor = policy.vf_features_extractor = casting
+    policy.double()
+    return learner
+
+
+class Seen:
+    """The norms before clipping and the gradients after it, one entry per minibatch; all parameters in one row."""
+
+    def __init__(self) -> None:
+        self.norms: list[float] = []
+        self.gradients: list[NDArray[Any]] = []
+
+
+@contextmanager
+def recorded(learner: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
+    """What an update clips, be it stock or lean."""
+    seen, policy = Seen(), learner.model.policy
+    stock_clip, lean_clip = torch.nn.utils.clip_grad_norm_, lean.clip_norm
+
+    def stock(parameters: Any, largest: float) -> torch.Tensor:
+        norm = stock_clip(parameters, largest)
+        seen.norms.append(float(norm))
+        seen.gradients.append(np.concatenate([parameter.grad.numpy().ravel() for parameter in policy.parameters()]))
+        return norm
+
+    def ours(gradient: torch.Tensor, largest: float) -> float:
+        norm = lean_clip(gradient, largest)
+        seen.norms.append(norm)
+        parameters = lean._parameters(policy)
+        parts = dict(zip(parameters, lean._parts(gradient, parameters), strict=True))
+        seen.gradients.append(np.concatenate([parts[parameter].numpy().ravel() for parameter in policy.parameters()]))
+        return norm
+
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.nn.utils, "clip_grad_norm_", stock)
+        patched.setattr(lean, "clip_norm", ours)
+        yield seen
+
+
+def state(learner: Any) -> dict[str, NDArray[Any]]:
+    """Weights and what the optimiser remembers."""
+    arrays, _ = learner.save()
+    return arrays
+
+
+def pair(env_id: str, *, double: bool, **changes: Any) -> tuple[Any, Any]:
+    learners = [learner_for(small(**changes, update=kind), env_id) for kind in ("stock", "lean")]
+    assert isinstance(learners[1].model, lean.LeanPPO)
+    assert not isinstance(learners[0].model, lean.LeanPPO)
+    if double:
+        learners = [doubled(learner) for learner in learners]
+    return learners[0], learners[1]
+
+
+def compare(
+    stock: Any, ours: Any, env_id: str, monkeypatch: pytest.MonkeyPatch, *, tolerance: float, updates: int = UPDATES
+) -> tuple[list[dict[str, float]], list[list[float]]]:
+    """The same shards into both, update for update. Returns each update's metrics, and its norms before clipping."""
+    told, norms = [], []
+    for number in range(updates):
+        shards = shards_of(stock, env_id, round=number)
+        done, seen = [], []
+        for learner in (stock, ours):
+            with recorded(learner, monkeypatch) as one:
+                done.append(learner.update(shards, round=number, steps=(number + 1) * stock._settings.n_steps))
+            seen.append(one)
+        assert done[0].gradient_steps == done[1].gradient_steps == len(seen[0].norms)
+        assert list(done[0].metrics) == list(done[1].metrics)
+        close(list(done[1].metrics.values()), list(done[0].metrics.values()), tolerance, str(list(done[0].metrics)))
+        close(done[1].advantages, done[0].advantages, tolerance, "advantages")
+        close(seen[1].norms, seen[0].norms, tolerance, "norms")
+        close(seen[1].gradients, seen[0].gradients, tolerance, "gradients")
+        expected, got = state(stock), state(ours)
+        assert got.keys() == expected.keys()
+        for name, array in expected.items():
+            assert got[name].dtype == array.dtype, name
+            close(got[name], array, tolerance, name)
+        told.append(done[1].metrics)
+        norms.append(seen[1].norms)
+    return told, norms
+
+
+def close(got: Any, expected: Any, tolerance: float, what: str) -> None:
+    np.testing.assert_allclose(got, expected, rtol=tolerance, atol=tolerance, err_msg=what)
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "tanh": {},
+    "relu": {"activation": "relu", "net_arch": (8, 6), "ent_coef": 0.05, "vf_coef": 0.9},
+    "no hidden layer": {"net_arch": ()},
+    "stopped by target_kl": {"target_kl": 2e-4, "learning_rate": 1e-3},
+    "gradients unclipped": {"max_grad_norm": None, "learning_rate": 1e-3},
+    "all clipped": {"max_grad_norm": 0.01, "clip_range": 0.01, "learning_rate": 3e-3},
+    "a smaller last minibatch": {"batch_size": 36},
+    "a last minibatch of one": {"batch_size": 19},
+    "one minibatch": {"batch_size": 1000, "normalize_advantage": False},
+    "scaled": {"normalize_observations": True, "normalize_rewards": True, "learning_rate_schedule": "linear"},
+}
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+@pytest.mark.parametrize("case", CASES)
+def test_twenty_updates_equal_stable_baselines3s(case: str, env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stock, ours = pair(env_id, double=True, **CASES[case])
+    told, norms = compare(stock, ours, env_id, monkeypatch, tolerance=1e-5)
+    # A case must be what its name says.
+    steps = {len(one) for one in norms}
+    if case == "stopped by target_kl":
+        assert min(steps) < max(steps) == 9
+    if case == "gradients unclipped":
+        assert max(max(one) for one in norms) > 0.5
+    if case == "all clipped":
+        assert min(min(one) for one in norms) > 0.01
+        assert max(one["clip_fraction"] for one in told) > 0.1
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+def test_single_precision_is_as_near_to_double_as_stable_baselines3s(env_id: str) -> None:
+    # Adam divides gradients by their size, so where they vanish rounding alone moves weights by up to a learning rate:
+    # no fixed tolerance is meaningful, but SB3's own distance from its update in double is.
+    changes: dict[str, Any] = {"net_arch": (64, 64), "batch_size": 48}
+    stock, ours = pair(env_id, double=False, **changes)
+    exact = doubled(learner_for(small(**changes), env_id))
+    for number in range(5):
+        shards = shards_of(exact, env_id, round=number)
+        for learner in (stock, ours, exact):
+            learner.update(shards, round=number, steps=(number + 1) * 96)
+    truth = vector(exact)
+    distances = [np.sqrt(np.mean((vector(learner) - truth) ** 2)) for learner in (stock, ours)]
+    assert 0.0 < distances[1] < 2.0 * distances[0] < 1e-4
+    moved = np.abs(vector(learner_for(small(**changes), env_id)) - truth)
+    assert moved.mean() > 1e-3
+
+
+def vector(learner: Any) -> NDArray[np.float64]:
+    """All weights in a row."""
+    return np.concatenate([array.ravel() for array in learner.scored().values()]).astype(np.float64)
+
+
+# ---- what it shares with stock ----
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+def test_a_checkpoint_restores_it_bit_for_bit(env_id: str) -> None:
+    config = small(update="lean", learning_rate_schedule="linear")
+    learner = learner_for(config, env_id)
+    for number in range(2):
+        update(learner, number, env_id)
+    stored = encode_checkpoint(Checkpoint(2, *learner.save()))
+    at_the_time = bits(learner)
+    metrics = [update(learner, number, env_id) for number in (2, 3)]
+
+    fresh = learner_for(config, env_id, seed=5)  # whose initial network is another one
+    again = decode_checkpoint(stored)
+    fresh.load(again.arrays, again.data)
+    assert bits(fresh) == at_the_time != bits(learner)
+    fresh._seed = learner._seed
+    assert [update(fresh, number, env_id) for number in (2, 3)] == metrics
+    assert bits(fresh) == bits(learner)
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+def test_stock_and_lean_go_on_from_each_others_checkpoints(env_id: str) -> None:
+    learners = [learner_for(small(update=kind), env_id) for kind in ("stock", "lean")]
+    shards = shards_of(learners[0], env_id)
+    for learner in learners:
+        learner.update(shards, round=0, steps=96)
+    saved = [learner.save() for learner in learners]
+    assert saved[0][0].keys() == saved[1][0].keys()
+    assert saved[0][1] == saved[1][1]
+    shapes = [{name: (array.shape, array.dtype) for name, array in arrays.items()} for arrays, _ in saved]
+    assert shapes[0] == shapes[1]
+    for first, second in (("stock", "lean"), ("lean", "stock")):
+        one, other = (doubled(learner_for(small(update=kind), env_id)) for kind in (first, second))
+        one.update(shards, round=0, steps=96)
+        other.load(*one.save())
+        done = [learner.update(shards, round=1, steps=192) for learner in (one, other)]
+        assert done[0].gradient_steps == done[1].gradient_steps
+        np.testing.assert_allclose(vector(other), vector(one), rtol=1e-9, atol=1e-9)
+
+
+def test_the_same_round_gives_the_same_bits_and_another_seed_others() -> None:
+    shards = shards_of(learner_for(small()))
+    learners = [learner_for(small(update="lean")) for _ in range(3)]
+    before = torch.get_rng_state()
+    for learner, number in zip(learners, (0, 1, 1), strict=True):
+        learner.update(shards, round=number, steps=96)
+    assert torch.equal(torch.get_rng_state(), before)
+    first, second, third = map(bits, learners)
+    assert first != second == third
+
+
+@pytest.mark.parametrize("reward", [np.nan, np.inf])
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+def test_rewards_that_are_no_numbers_end_as_divergence(env_id: str, reward: float) -> None:
+    learner = learner_for(small(update="lean"), env_id)
+    first, second = shards_of(learner, env_id)
+    second.rewards[5, 1] = reward
+    with pytest.raises(SpaceDistError, match="training diverged in update 8"):
+        learner.update([first, second], round=7, steps=96)
+
+
+@pytest.mark.parametrize("rate", [1e30, 1e38])
+def test_an_absurd_learning_rate_ends_as_divergence(rate: float) -> None:
+    learner = learner_for(small(update="lean", learning_rate=rate))
+    with pytest.raises(SpaceDistError, match=r"training diverged in update \d.*learning_rate"):  # noqa: PT012
+        for number in range(4):
+            update(learner, number)
+
+
+# ---- config ----
+
+SPACE = Path(__file__).parent.parent / "configs/pointmass_space.yaml"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["learner.update=lean", "learner.policy=CnnPolicy"], "learner: update: lean knows MlpPolicy only"),
+        (["learner.update=lean", "learner.policy=my.module:Mine"], "knows MlpPolicy only, not my.module:M"),
+        (["learner.update=leam"], "learner.update"),
+        (["learner.update=lean", "learner.kind=a2c"], "learner.*update"),
+    ],
+)
+def test_what_it_cannot_do_is_refused(overrides: list[str], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        configs.load(SPACE, overrides)
+
+
+def test_observations_that_are_not_flat_are_refused() -> None:
+    images = spaces.Box(0, 255, shape=(3, 36, 36), dtype=np.uint8)
+    with pytest.raises(ConfigError, match="MlpPolicy needs flat observations"):
+        make_learner(small(update="lean"), images, BOX, seed=0, n_slots=1, slot_length=4, total_steps=4)
+
+
+def test_the_update_is_part_of_what_a_run_is_and_stock_changes_no_identity() -> None:
+    plain, stock, ours = (
+        configs.identity(configs.load(SPACE, overrides), "train", "test")
+        for overrides in ([], ["learner.update=stock"], ["learner.update=lean"])
+    )
+    assert plain == stock != ours
