@@ -760,6 +760,15 @@ class RunConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _one_way_to_update(self) -> Self:
+        if self.engine == "population" and isinstance(self.learner, PPOConfig) and self.learner.update != "stock":
+            raise ValueError(
+                f"learner.update: {self.learner.update} says nothing with engine: population, which has updates of its "
+                "own; use engine: single"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _population_shares_a_curriculum(self) -> Self:
         if self.members == 1:
             return self

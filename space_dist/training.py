@@ -697,7 +697,8 @@ def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
     """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
     if config.engine != "auto":
         return config
-    env, engine = make_env(config), "population" if can_share else "single"
+    stock = getattr(config.learner, "update", "stock") == "stock"
+    env, engine = make_env(config), "population" if can_share and stock and not config.rollout.overlap else "single"
     try:
         refuse_population(config.learner, env.observation_space, env.action_space)
     except ConfigError:
