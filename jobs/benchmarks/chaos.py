@@ -130,12 +130,17 @@ def chaos(
     steps: Annotated[int, typer.Option(min=5_120, help="Environment steps of each run.")] = 122_880,
     seed: Annotated[int, typer.Option(min=0, help="Of kinds, moments and victims.")] = 0,
     kind: Annotated[Optional[list[str]], typer.Option(help="Only these kinds of faults; repeatable.")] = None,  # noqa: UP045
+    population: Annotated[bool, typer.Option(help="Runs share their processes (engine: population).")] = False,
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
 ) -> None:
     """Faults over a grid on Ray and MLflow: recovered, results identical, nothing lost, doubled or left behind."""
     if unknown := sorted({*(kind or ())} - {*KINDS}):
         raise ConfigError(f"--kind {unknown[0]!r} is not known{nearest(unknown[0], KINDS)} Allowed: {', '.join(KINDS)}")
-    result = rehearse(runs=runs, steps=steps, seed=seed, kinds=kind or KINDS, count=faults, say=console.print)
+    possible = [name for name in KINDS if not (population and name.endswith("actor"))]
+    settings = {**SETTINGS, "engine": "population"} if population else SETTINGS
+    result = rehearse(
+        runs=runs, steps=steps, seed=seed, kinds=kind or possible, count=faults, say=console.print, settings=settings
+    )
     _show(result)
     if json_file is not None:
         json_file.write_text(json.dumps(asdict(result), indent=1) + "\n")
@@ -150,8 +155,8 @@ def rehearse(
 ) -> Result:  # fmt: skip
     """Work on one grid twice, once left alone and once not; returns what was found.
 
-    base, settings: the config of its runs, and what is changed of it. last: see `plan`. after_faults: called when all
-    faults have fallen.
+    base, settings: the config of its runs, and what is changed of it; with `engine: population` runs share a process
+    and have no actors. last: see `plan`. after_faults: called when all faults have fallen.
     """
     mark = secrets.token_hex(8)
     folder = Path(tempfile.mkdtemp(prefix="sd", dir="/tmp"))
@@ -212,7 +217,8 @@ def _grid_file(
         "name": "chaos", "extends": str(base), "set": {**settings, "checkpoint.every_rounds": 1},
         "grid": {"curriculum.kappa": [1, 16][:cells]}, "seeds": {"count": runs // cells},
         "resources": {
-            "workers": 0 if uri is None else 1, "grace_seconds": 5.0, "late_seconds": 6.0,
+            "workers": 0 if uri is None or settings.get("engine") == "population" else 1,
+            "grace_seconds": 5.0, "late_seconds": 6.0,
             "first_answer_seconds": 60.0,
         },
         "retry": {"killed": 1000, "node_lost": 1000, "preempted": 1000}, "tracking": {"uri": uri},
@@ -461,7 +467,7 @@ class _Rehearsal:
         if not counts:  # it ended just then
             raise _Missed
         whose = "all" if name in OF_ALL else chosen.run.title
-        hurt = [] if name in OF_ALL else [chosen.run]
+        hurt = [] if name in OF_ALL else [one.run for one in _sharing(chosen, live)]
         self._open.append(_Open(fault, whose, start, victims, live, moved, hurt))
 
     def _has_got_on(self, before: _Live, moved: bool) -> bool:
@@ -477,19 +483,19 @@ class _Rehearsal:
         self, name: str, chosen: _Live, live: Sequence[_Live]
     ) -> tuple[list[psutil.Process], Sequence[_Live], Callable[[], None] | None]:
         """The processes to hit, the runs that go on in another process then, and what has to be restarted."""
-        driver, supervisor = chosen.driver, chosen.driver.parent()
+        driver, supervisor, sharing = chosen.driver, chosen.driver.parent(), _sharing(chosen, live)
         if supervisor is None or not _is(supervisor, "space_dist.supervisor"):
             raise _Missed
         if name.endswith("actor"):
             kind = {"rollout actor": "RolloutActor", "curriculum actor": "CurriculumActor"}[name]
             return [self._actor(kind, driver)], [], None
         if name in ("driver", "supervisor"):
-            return [driver if name == "driver" else supervisor], [chosen], None
+            return [driver if name == "driver" else supervisor], sharing, None
         if name == "pool worker":
             worker = supervisor.parent()
             if worker is None or not _is(worker, "ray::PoolWorker"):
                 raise _Missed
-            return [worker], [chosen], None
+            return [worker], sharing, None
         if name == "conductor":
             return [self._conductor()], live, None
         if name == "submitter":
@@ -576,6 +582,11 @@ class _Rehearsal:
                 if missing != more:
                     yield (f"{run.title}: MLflow lacks {(missing - more).total()} points of {missing.total()} and has "
                            f"{(more - missing).total()} too many")  # fmt: skip
+
+
+def _sharing(chosen: _Live, live: Sequence[_Live]) -> list[_Live]:
+    """The runs that a run shares its process with, itself included."""
+    return [one for one in live if one.driver == chosen.driver]
 
 
 def _points(ledger: Ledger) -> Iterator[tuple[str, int, int, float]]:
