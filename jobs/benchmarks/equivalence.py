@@ -30,7 +30,7 @@ from space_dist.errors import SpaceDistError
 from space_dist.manifest import Grid
 
 ROOT = Path(__file__).resolve().parents[2]
-MARGIN = 0.05  # share of the pilot's mean return
+MARGIN = 0.1  # share of the pilot's mean return
 ALPHA = 0.05  # of each one-sided test
 POWER = 0.8  # where there is no difference
 PILOT = range(1000, 1012)
