@@ -45,7 +45,7 @@ PAIRS = {  # a ratio: the task, ours, and the rival
     "lean_vs_rllib": ("pointmass", "lean", "rllib"),
     "batched_vs_subproc2": ("pointmass_large", "lean", "subproc2"),
     "batched_vs_sb3_batched": ("pointmass_large", "lean", "sb3_batched"),
-    "ant_vs_subproc2": ("ant", "lean", "subproc2"),
+    "ant_vs_subproc2": ("ant", "overlap", "subproc2"),
     "population_vs_best_sb3": ("population", "population", "best_sb3"),
 }
 console = Console()
@@ -144,6 +144,8 @@ def _rows(task: str, seconds: float) -> dict[str, Row]:
         found["rllib"] = _best(task, [Contender("rllib", runners=r, n_envs=n) for r, n in RUNNERS], seconds)
     workers = CORES if TASKS[task].shards > 1 else 0
     found |= {update: Contender("ours", update=update, workers=workers) for update in ("stock", "lean")}
+    if workers:
+        found["overlap"] = replace(found["lean"], overlap=True)
     return {
         name: Row(
             contender.title, contender.setting, lambda contender=contender: _rate(task, contender, seconds),  # type: ignore[misc]
