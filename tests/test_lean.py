@@ -306,7 +306,7 @@ def test_observations_that_are_not_flat_are_refused() -> None:
 
 def test_a_population_has_an_update_of_its_own() -> None:
     overrides = ["learner.update=lean", "resources.workers=0"]
-    with pytest.raises(ConfigError, match="learner.update: lean is for runs that work alone"):
+    with pytest.raises(ConfigError, match=r"learner\.update: lean is for runs that work alone"):
         learner_of(configs.load(SPACE, [*overrides, "engine=population"]))
     assert resolved(configs.load(SPACE, [*overrides, "engine=auto"])).engine == "single"
     assert resolved(configs.load(SPACE, ["engine=auto"])).engine == "population"
