@@ -207,7 +207,7 @@ def make_curriculum(config: RunConfig, train: InstanceSet) -> Curriculum:
     env, rollout = config.env, config.rollout
     return Makers(
         train, source=str(config.instances.train), seed=config.seed,
-        draws=Draws(config.n_episodes or config.learner.n_steps, rollout.shards),
+        draws=Draws(config.n_episodes or config.learner.n_steps * config.members, rollout.shards * config.members),
         bounds=lambda: make_batched(env.id, 1, context_visible=False, kwargs=env.kwargs).context_bounds,
     ).make(config.curriculum)  # fmt: skip
 

@@ -106,6 +106,11 @@ class GrowingConfig(_Curriculum):
     epsilon: float = Field(default=1e-3, gt=0.0)
     """Reward units: adaptive_eta raises eta to (|change| + epsilon) / max(V_{t-1}, epsilon). Source: Theorem 2 (any
     number above 0); the value and the floor are ours."""
+    aggregate: Literal["own", "population"] = "own"
+    """Whose values decide. own: the policy's. population: the mean over `policies` policies, which the run trains side
+    by side (engine: population) and which share the selection: one run, and one sample. Source: ours."""
+    policies: int = Field(default=4, ge=2, le=64)
+    """With aggregate: population, how many. Each collects learner.n_steps steps an update; all count in the budget."""
 
     @model_validator(mode="after")
     def _growth_is_possible(self) -> Self:
@@ -755,6 +760,28 @@ class RunConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _one_way_to_update(self) -> Self:
+        if self.engine == "population" and isinstance(self.learner, PPOConfig) and self.learner.update != "stock":
+            raise ValueError(
+                f"learner.update: {self.learner.update} says nothing with engine: population, which has updates of its "
+                "own; use engine: single"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _population_shares_a_curriculum(self) -> Self:
+        if self.members == 1:
+            return self
+        if self.engine == "single" or not isinstance(self.learner, PPOConfig):
+            raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo")
+        if self.learner.normalize_observations or self.learner.normalize_rewards:
+            raise ValueError(
+                "curriculum.aggregate: population cannot be combined with learner.normalize_observations or "
+                "learner.normalize_rewards: the policies' values would have scales of their own"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _whole_slots(self) -> Self:
         per_step = self.rollout.shards * self.rollout.slots
         if self.n_episodes is not None:
@@ -777,6 +804,12 @@ class RunConfig(Section):
         return self
 
     @property
+    def members(self) -> int:
+        """Policies that the run trains."""
+        curriculum = self.curriculum
+        return curriculum.policies if isinstance(curriculum, GrowingConfig) and curriculum.aggregate != "own" else 1
+
+    @property
     def n_episodes(self) -> int | None:
         """Episodes per round, where rounds end by episodes."""
         return None if isinstance(self.learner, _OnPolicy) else self.learner.n_episodes
@@ -789,7 +822,7 @@ class RunConfig(Section):
 
     def round_steps(self, horizon: int) -> int:
         """Environment steps of a round; the most there can be, where rounds end by episodes."""
-        return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots
+        return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots * self.members
 
 
 NOT_IDENTITY = ("name", "checkpoint", "tracking", "resources")  # what cannot change a result

@@ -28,7 +28,7 @@ from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedEr
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
-from space_dist.policy import Policy, from_arrays
+from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
 from space_dist.training import Progress, Training, make_env, make_setup, policy_in, resolved
@@ -287,8 +287,8 @@ def lasting(path: Path, option: str) -> Path:
     return path.absolute()
 
 
-def policy_of(ledger: Ledger) -> Policy:
-    """The policy of a finished run, or that of an unfinished one's last checkpoint.
+def policy_of(ledger: Ledger) -> Policy | Several:
+    """The policy, or policies, of a finished run, or those of an unfinished one's last checkpoint.
 
     Raises LedgerError where there is none, and where it is damaged.
     """

@@ -25,8 +25,8 @@ from space_dist.envs.interface import Closable
 from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, begun, speaking
-from space_dist.learner import PopulationLearner, learn_together
-from space_dist.rollout import Outcomes, Rollout, Setup, Split, Trial, Walk, collect, evaluate
+from space_dist.learner import CoupledLearner, PopulationLearner, learn_together
+from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Trial, Walk, collect, evaluate
 from space_dist.training import Learn, Wait, Work
 
 _SLOTS = 1024  # environments stepped together, at most: what the cache holds of them. Decides no result
@@ -79,22 +79,50 @@ def advance(
 
 def _learned(asked: Mapping[Path, Wait | Learn]) -> dict[Path, Any]:
     """The updates of all members, or what became of them."""
-    requests = {folder: request for folder, request in asked.items() if isinstance(request, Learn)}
-    stacks: dict[Hashable, list[Path]] = defaultdict(list)
-    for folder, request in requests.items():
-        if not isinstance(request.learner, PopulationLearner):
-            raise TypeError(f"{folder}: a member of a population needs engine: population")
-        stacks[request.learner.key].append(folder)
-    answers: dict[Path, Any] = {}
-    for folders in stacks.values():
-        stack = [requests[folder] for folder in folders]
+    stacks: dict[Hashable, list[_Part]] = defaultdict(list)
+    made: dict[Path, list[Any]] = {}
+    for folder, request in asked.items():
+        if isinstance(request, Learn):
+            for part in _parts_of(folder, request):
+                stacks[part.learner.key].append(part)
+    for parts in stacks.values():
         updates = learn_together(
-            [request.learner for request in stack if isinstance(request.learner, PopulationLearner)],
-            [request.shards for request in stack],
-            round=[request.round for request in stack], steps=[request.steps for request in stack],
+            [part.learner for part in parts], [part.shards for part in parts],
+            round=[part.request.round for part in parts], steps=[part.request.steps for part in parts],
         )  # fmt: skip
-        answers |= dict(zip(folders, updates, strict=True))
+        for part, update in zip(parts, updates, strict=True):
+            made.setdefault(part.folder, []).append(update)
+    answers: dict[Path, Any] = {}
+    for folder, request in asked.items():
+        if isinstance(request, Learn):
+            answers[folder] = made[folder][0]
+            if isinstance(request.learner, CoupledLearner):
+                try:
+                    answers[folder] = request.learner.joined(made[folder])
+                except SpaceDistError as error:
+                    answers[folder] = error
     return answers
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One policy's share of an update."""
+
+    folder: Path
+    request: Learn
+    learner: PopulationLearner
+    shards: Sequence[Shard]
+
+
+def _parts_of(folder: Path, request: Learn) -> Iterator[_Part]:
+    learner = request.learner
+    if isinstance(learner, CoupledLearner):
+        for one, shards in zip(learner.members, learner.parts(request.shards), strict=True):
+            yield _Part(folder, request, one, shards)
+    elif isinstance(learner, PopulationLearner):
+        yield _Part(folder, request, learner, request.shards)
+    else:
+        raise TypeError(f"{folder}: a member of a population needs engine: population")
 
 
 @dataclass(eq=False)

@@ -34,7 +34,7 @@ from space_dist.instances import InstanceSet, read_csv
 from space_dist.launch import policy_of
 from space_dist.ledger import Ledger, atomic_write
 from space_dist.mazes import CELLS, SIDE, shortest_ways, successors
-from space_dist.policy import Policy
+from space_dist.policy import Policy, members_of
 from space_dist.rollout import Split
 from space_dist.seeding import Purpose, episode_seeds
 
@@ -99,7 +99,7 @@ class Gallery:
 
     def __init__(self, ledger: Ledger) -> None:
         self._config: RunConfig = configs.load(ledger.config)
-        self._policy: Policy = policy_of(ledger)
+        self._policy: Policy = members_of(policy_of(ledger))[0]  # the first, where the run trains several
         self._env = self._make()
         bounds = self._env.context_bounds
         self._sets: dict[Split, InstanceSet] = {

@@ -20,7 +20,7 @@ from space_dist.envs import BatchedEnv, Observations, make_batched
 from space_dist.envs.observations import allocate, concatenate, put, rows, take
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.policy import Noise, Policy, Valuing, side_by_side
+from space_dist.policy import Noise, Policy, Several, Valuing, members_of, side_by_side
 from space_dist.seeding import Purpose, episode_seeds, generator
 
 FloatArray = NDArray[np.float64]
@@ -183,6 +183,7 @@ class Setup:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     episodes_per_round: int | None = None  # a round ends with this many episodes instead of with its slots' length
     keep_next_observations: bool = False
+    members: int = 1  # policies; each has an equal share of the shards, and of the parts of an evaluation
 
     def make_env(self, n_slots: int) -> BatchedEnv:
         """An environment of the run, as its policy sees it."""
@@ -204,11 +205,14 @@ class Setup:
 
     @property
     def evaluation_parts(self) -> int:
-        """Pieces into which the evaluation of one split is cut."""
+        """Pieces into which the evaluation of one split, by every member, is cut."""
         return self.shards
 
+    def _member(self, policy: Policy | Several, part: int) -> Policy:
+        return members_of(policy)[part // (self.shards // self.members)]
+
     def rollout(
-        self, policy: Policy, selection: Selection, walk: Walk,
+        self, policy: Policy | Several, selection: Selection, walk: Walk,
         *, round: int, steps: int, shard: int, selection_version: int, lag: int = 0,
     ) -> Rollout:  # fmt: skip
         """One shard of one round, which begins after `steps` environment steps.
@@ -221,17 +225,19 @@ class Setup:
                 f"and got selection {selection.version} and policy {policy.version}"
             )
         return Rollout(
-            policy, selection, start=walk.position(selection, shard, self.shards), gamma=self.gamma, seed=self.seed,
-            round=round, shard=shard, steps=steps + shard * self.slots * self.slot_length,
+            self._member(policy, shard), selection, start=walk.position(selection, shard, self.shards),
+            gamma=self.gamma, seed=self.seed, round=round, shard=shard,
+            steps=steps + shard * self.slots * self.slot_length,
         )  # fmt: skip
 
-    def trial(self, policy: Policy, split: Split, part: int, *, stochastic: bool = False) -> Trial:
+    def trial(self, policy: Policy | Several, split: Split, part: int, *, stochastic: bool = False) -> Trial:
         """Episodes on one part of a split: deterministic ones, or `stochastic` ones for the released code's metric."""
         instances, number = self.instances(split), 0 if split == "train" else 1
         count = len(instances) * self.evaluation_episodes
-        mine = np.array_split(np.arange(count), self.evaluation_parts)[part]
+        parts_each = self.evaluation_parts // self.members
+        mine = np.array_split(np.arange(count), parts_each)[part % parts_each]
         return Trial(
-            policy, instances.contexts[mine // self.evaluation_episodes],
+            self._member(policy, part), instances.contexts[mine // self.evaluation_episodes],
             episode_seeds(self.seed, Purpose.EVALUATION, number, count=count)[mine], self.gamma,
             generator(self.seed, Purpose.EVALUATION, 2 + number, part) if stochastic else None,
         )  # fmt: skip
@@ -254,7 +260,7 @@ class Worker:
         self._scoring: BatchedEnv | None = None
         self._starts: dict[int, Observations] = {}
 
-    def collect(self, policy: Policy, selection: Selection, walk: Walk, **asked: int) -> Shard:
+    def collect(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> Shard:
         """One shard of one round; `asked`: see `Setup.rollout`."""
         setup = self._setup
         return collect(
@@ -294,7 +300,7 @@ class Worker:
         """See `Setup.probe`."""
         return self._measured(self._setup.probe(policy, indices, version, part))
 
-    def evaluate(self, policy: Policy, split: Split, part: int, *, stochastic: bool = False) -> Outcomes:
+    def evaluate(self, policy: Policy | Several, split: Split, part: int, *, stochastic: bool = False) -> Outcomes:
         """See `Setup.trial`."""
         return self._measured(self._setup.trial(policy, split, part, stochastic=stochastic))
 

@@ -37,6 +37,7 @@ class Purpose(enum.IntEnum):
     MIXTURE = 15
     ENSEMBLE = 16
     ENSEMBLE_UPDATE = 17
+    MEMBERS = 18
 
 
 def seed_sequence(seed: int, purpose: Purpose, *keys: int) -> np.random.SeedSequence:
@@ -52,6 +53,11 @@ def generator(seed: int, purpose: Purpose, *keys: int) -> np.random.Generator:
 def episode_seeds(seed: int, purpose: Purpose, *keys: int, count: int) -> UInt64Array:
     """`(count,)` independent seeds, below 2**63 so that any Gymnasium environment takes them."""
     return seed_sequence(seed, purpose, *keys).generate_state(count, np.uint64) >> np.uint64(1)
+
+
+def member_seeds(seed: int, count: int) -> UInt64Array:
+    """`(count,)` seeds, below 2**31, of the policies of a run that trains several."""
+    return seed_sequence(seed, Purpose.MEMBERS).generate_state(count, np.uint64) >> np.uint64(33)
 
 
 def mix(values: UInt64Array) -> UInt64Array:

@@ -43,8 +43,10 @@ from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
 from space_dist.learner import (
     Arrays,
+    CoupledLearner,
     Ensemble,
     Learner,
+    PopulationLearner,
     Update,
     make_ensemble,
     make_learner,
@@ -53,7 +55,7 @@ from space_dist.learner import (
     stack_key,
 )
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
-from space_dist.policy import MlpPolicy, Policy, Statistics, blind, to_arrays
+from space_dist.policy import MlpPolicy, Policy, Several, Statistics, blind, members_of, to_arrays
 from space_dist.rollout import (
     CUT,
     Outcomes,
@@ -63,6 +65,7 @@ from space_dist.rollout import (
     Walk,
     joined,
 )
+from space_dist.seeding import member_seeds
 
 log = logging.getLogger("space_dist")
 
@@ -79,7 +82,7 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         context_visible=config.env.context_visible,
         seed=config.seed,
         gamma=config.learner.gamma,
-        shards=config.rollout.shards,
+        shards=config.rollout.shards * config.members,
         slots=config.rollout.slots,
         slot_length=config.slot_length(horizon),
         start_states=config.rollout.start_states,
@@ -89,6 +92,7 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         env_kwargs=config.env.kwargs,
         episodes_per_round=config.n_episodes,
         keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
+        members=config.members,
     )
     probes = config.learner.normalize_observations or config.learner.normalize_rewards
     needed = config.round_steps(horizon) * (2 if probes else 1)
@@ -230,7 +234,7 @@ class Wait:
 class Learn:
     """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
 
-    learner: Learner
+    learner: Learner | CoupledLearner
     shards: list[Shard]
     round: int
     steps: int
@@ -326,7 +330,7 @@ class Training:
         """One round of actions that ignore the observation gives the first scales; its steps count like any others."""
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
-        seeing = self.learner.policy(0)
+        (seeing,) = members_of(self.learner.policy(0))
         policy = blind(seeing, self._setup.make_env(1).action_space, PROBE)
         handles = cluster.collect(
             cluster.put(policy), cluster.put(selection), run.walk, round=PROBE, steps=0, version=selection.version
@@ -380,7 +384,8 @@ class Training:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
         rescored, members, episodes, context_values = [], [], [], []
-        if self.learner.normalises:  # both values at one scale: else a change of scale would look like progress
+        if isinstance(self.learner, Learner) and self.learner.normalises:
+            # Both values at one scale: else a change of scale would look like progress.
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         if self.ensemble is not None:
             members = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
@@ -409,7 +414,7 @@ class Training:
     def _know_selection(self, selection: Selection) -> None:
         run, config = self._run, self._config
         episodes = config.rollout.passes * len(selection.ids)
-        per_round = config.n_episodes or config.learner.n_steps / self._horizon
+        per_round = config.n_episodes or config.learner.n_steps * config.members / self._horizon
         run.rounds_left = 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
         run.trained = selection
         if not selection.drawn:
@@ -428,7 +433,7 @@ class Training:
             arrived = iter(answers)
             for split in splits:
                 outcomes = joined([next(arrived) for _ in asked[split]])
-                row[split] = _summary(outcomes, settings.episodes)
+                row[split] = _summary(outcomes, len(self._setup.instances(split)), settings.episodes)
             for split in legacy:
                 outcomes = joined([next(arrived) for _ in legacy[split]])
                 returns = checked(outcomes.backward_discounted_returns, "returns")
@@ -662,7 +667,7 @@ class Training:
         if self.ensemble is not None:
             self.ensemble.load(_under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
-        if acted := _under("acted/", arrays):
+        if (acted := _under("acted/", arrays)) and isinstance(self.learner, Learner):
             run.acted = acted
             run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
@@ -692,7 +697,8 @@ def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
     """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
     if config.engine != "auto":
         return config
-    env, engine = make_env(config), "population" if can_share else "single"
+    stock = getattr(config.learner, "update", "stock") == "stock"
+    env, engine = make_env(config), "population" if can_share and stock and not config.rollout.overlap else "single"
     try:
         refuse_population(config.learner, env.observation_space, env.action_space)
     except ConfigError:
@@ -709,12 +715,19 @@ def stack_of(config: RunConfig) -> str:
     return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
 
 
-def learner_of(config: RunConfig) -> Learner:
+def learner_of(config: RunConfig) -> Learner | CoupledLearner:
     """A config's learner with its initial networks."""
+    if config.members == 1:
+        return _learner_of(config, config.seed)
+    members = [_learner_of(config, int(seed)) for seed in member_seeds(config.seed, config.members)]
+    return CoupledLearner([member for member in members if isinstance(member, PopulationLearner)])
+
+
+def _learner_of(config: RunConfig, seed: int) -> Learner:
     env = make_env(config)
     return make_learner(
         config.learner, env.observation_space, env.action_space,
-        seed=config.seed, n_slots=config.rollout.shards * config.rollout.slots,
+        seed=seed, n_slots=config.rollout.shards * config.rollout.slots,
         slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
         population=config.engine == "population",
     )  # fmt: skip
@@ -726,26 +739,27 @@ def ensemble_of(config: RunConfig) -> Ensemble | None:
     return make_ensemble(config, env.observation_space, env.context_bounds.names)
 
 
-def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy:
-    """The policy that a checkpoint holds."""
+def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy | Several:
+    """The policy, or policies, that a checkpoint holds."""
     learner = learner_of(config)
     _load_learner(learner, checkpoint)
     return learner.policy(checkpoint.round)
 
 
-def model_of(learner: Learner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def model_of(learner: Learner | CoupledLearner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """A trained policy as arrays and a description: layer by layer, or as torch's state where NumPy cannot act."""
     policy = learner.policy(version)
     if isinstance(policy, MlpPolicy):
         return to_arrays(policy)
     arrays = learner.scored()
+    first = learner.members[0] if isinstance(learner, CoupledLearner) else learner
     return arrays, {
-        "format": 2, "version": version, "policy": "torch", "class": str(type(learner.model.policy)),
+        "format": 2, "version": version, "policy": "torch", "class": str(type(first.model.policy)),
         "shapes": {name: list(array.shape) for name, array in arrays.items()},
     }  # fmt: skip
 
 
-def _load_learner(learner: Learner, checkpoint: Checkpoint) -> None:
+def _load_learner(learner: Learner | CoupledLearner, checkpoint: Checkpoint) -> None:
     learner.load(_under("learner/", checkpoint.arrays), checkpoint.data["learner"])
 
 
@@ -807,13 +821,13 @@ def _rollout_sums(shards: list[Shard], *, lag: int) -> dict[str, float]:
     return sums
 
 
-def _summary(outcomes: Outcomes, episodes: int) -> dict[str, Any]:
-    """Means over a split, and each instance's mean return in id order."""
+def _summary(outcomes: Outcomes, instances: int, episodes: int) -> dict[str, Any]:
+    """Means over a split, and each instance's mean return in id order; over all policies, where there are several."""
     returns = checked(outcomes.returns, "returns")
     return {
         "return": float(returns.mean()),
         "discounted_return": float(outcomes.discounted_returns.mean()),
         "length": float(outcomes.lengths.mean()),
         "success": None if np.isnan(outcomes.success).any() else float(outcomes.success.mean()),
-        "returns": returns.reshape(-1, episodes).mean(axis=1).tolist(),
+        "returns": returns.reshape(-1, instances, episodes).mean(axis=(0, 2)).tolist(),
     }

@@ -638,8 +638,15 @@ COMPANIONS: dict[str, dict[str, Any]] = {
     "rollout.slots": {"learner.n_episodes": None},
     "learner.n_episodes": {"rollout.shards": 1, "rollout.slots": 1},
 }
-# Valid only together with others; see test_identity_depends_on_the_fixed_subset and ..._on_the_target.
-INSEPARABLE = ("curriculum.ids", "curriculum.target", "curriculum.target_mean", "curriculum.target_std")
+# Valid only together with others; see the tests of the fixed subset, the target, and what only some learners can.
+INSEPARABLE = (
+    "curriculum.aggregate",
+    "rollout.overlap",
+    "curriculum.ids",
+    "curriculum.target",
+    "curriculum.target_mean",
+    "curriculum.target_std",
+)
 CASES = [(name, key) for name, config in CONFIGS.items() for key, _ in leaves(config.model_dump(mode="json"))
          if not key.endswith(".kind") and key not in INSEPARABLE]  # fmt: skip
 
@@ -714,6 +721,12 @@ def test_identity_depends_on_the_target_of_self_paced_contexts() -> None:
     chosen = ["set_moments", *(f"normal, target_mean: [{mean}], target_std: [{std}]"
                                for mean, std in ((1, 1), (2, 1), (1, 2)))]  # fmt: skip
     assert len({ident(load(SPACE, [f"curriculum={{kind: spdrl, target: {text}}}"])) for text in chosen}) == len(chosen)
+
+
+def test_identity_depends_on_what_only_some_learners_can() -> None:
+    shared = "curriculum={kind: space, aggregate: population}"
+    assert ident(load(SPACE, ["engine=population", shared])) != ident(load(SPACE, ["engine=population"]))
+    assert ident(load(SPACE, ["rollout.overlap=true"])) != ident(load(SPACE))
 
 
 def test_identity_depends_on_the_kinds() -> None:

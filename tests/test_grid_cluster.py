@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import secrets
-import signal
-import socket
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
-import requests
 
 from space_dist.launch import private_ray
 from space_dist.ledger import METRICS, this_process
@@ -25,84 +21,28 @@ from space_dist.manifest import Grid, Run
 from space_dist.standing import Attempts
 from tests.grids import ROOT, write_grid
 
+sys.path.append(str(ROOT / "jobs"))
+
+from benchmarks.servers import RayHead
+
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(400)]
 
 
-def _free_ports(count: int) -> list[int]:
-    """Below Ray's own range for workers. Ray's default ports may be another Ray's."""
-    ports: list[int] = []
-    while len(ports) < count:
-        with socket.socket() as listening, contextlib.suppress(OSError):
-            port = 6400 + secrets.randbelow(3000)
-            listening.bind(("127.0.0.1", port))
-            ports.append(port)
-    return ports
-
-
-class RayCluster:
-    """`ray start --head` in its own process group: no `ray stop`, which would end other people's, too."""
-
-    def __init__(self, folder: Path) -> None:
-        ports = _free_ports(3)
-        self.address = f"http://127.0.0.1:{ports[1]}"
-        token = secrets.token_hex(32)
-        self.environment = {
-            **os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token, "RAY_USAGE_STATS_ENABLED": "0",
-            "PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        }  # fmt: skip
-        command = [
-            str(Path(sys.executable).parent / "ray"), "start", "--head", "--block", "--num-cpus=3",
-            f"--port={ports[0]}", "--dashboard-host=127.0.0.1", f"--dashboard-port={ports[1]}",
-            f"--dashboard-agent-listen-port={ports[2]}", "--object-store-memory=150000000",
-            f"--temp-dir={folder}", "--disable-usage-stats",
-        ]  # fmt: skip
-        self.process = subprocess.Popen(
-            command, env=self.environment, start_new_session=True,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        self._headers = {"Authorization": f"Bearer {token}"}
-        deadline = time.monotonic() + 90
-        while time.monotonic() < deadline:
-            try:
-                if requests.get(f"{self.address}/api/jobs/", headers=self._headers, timeout=5).ok:
-                    return
-            except requests.RequestException:
-                time.sleep(0.3)
-        raise RuntimeError("Ray did not start")
-
-    def jobs(self) -> list[dict[str, Any]]:
-        found: list[dict[str, Any]] = requests.get(
-            f"{self.address}/api/jobs/", headers=self._headers, timeout=30
-        ).json()  # fmt: skip
-        return found
-
-    def command(self, *arguments: object) -> list[str]:
-        return [sys.executable, "-m", "space_dist.cli", *map(str, arguments)]
-
-    def start(self, *arguments: object) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            self.command(*arguments), env=self.environment, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )  # fmt: skip
-
-    def end(self) -> None:
-        tree = psutil.Process(self.process.pid).children(recursive=True)
-        os.killpg(self.process.pid, signal.SIGKILL)
-        for process in tree:
-            try:
-                process.kill()
-            except psutil.NoSuchProcess:
-                continue
-        self.process.wait()
-
-
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[RayCluster]:
+def cluster() -> Iterator[RayHead]:
     folder = Path(f"/tmp/sd{secrets.token_hex(4)}")  # noqa: S108 - socket paths must be short
-    made = RayCluster(folder)
-    yield made
-    made.end()
-    subprocess.run(["rm", "-rf", str(folder)], check=True)
+    try:
+        with RayHead(folder, 3, {**os.environ, "PYTHONPATH": str(ROOT)}, Path(os.devnull)) as head:
+            yield head
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def start(cluster: RayHead, *arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "space_dist.cli", *map(str, arguments)], env=cluster.environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
 
 
 def begun(grid: Grid, runs: list[Run]) -> list[int]:
@@ -113,42 +53,40 @@ def metrics(grid: Grid, runs: list[Run]) -> list[bytes]:
     return [(grid.ledger(run).folder / METRICS).read_bytes() for run in runs]
 
 
-def test_twelve_jobs_submitted_by_two_at_once_run_once_each(cluster: RayCluster, tmp_path: Path) -> None:
+def test_twelve_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_path: Path) -> None:
     path = write_grid(tmp_path, seeds={"count": 6})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", "jobs")
-    both = [cluster.start(*submit) for _ in range(2)]
+    both = [start(cluster, *submit) for _ in range(2)]
     said = [process.communicate(timeout=300)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     assert all("small: 12 of 12 runs done" in text for text in said)
     grid = Grid(tmp_path / "runs/small")
     runs = grid.manifest().runs()
     assert begun(grid, runs) == [1] * 12
-    jobs = [job for job in cluster.jobs() if (job["metadata"] or {}).get("folder") == str(grid.folder)]
+    jobs = [job for job in cluster.ask("/api/jobs/") if (job["metadata"] or {}).get("folder") == str(grid.folder)]
     assert sorted(job["submission_id"] for job in jobs) == sorted(f"small-{run.cell.id}-s{run.seed}-a1" for run in runs)
     assert {job["metadata"]["code"] for job in jobs} == {grid.manifest().code}
     assert all("/" not in job["submission_id"] for job in jobs)
     before = metrics(grid, runs)
-    again = cluster.start(*submit)
+    again = start(cluster, *submit)
     assert "12 of 12 runs done" in again.communicate(timeout=120)[0]
     assert again.returncode == 0
     assert begun(grid, runs) == [1] * 12
     assert metrics(grid, runs) == before
-    local = cluster.start("grid", "run", path, "--root", tmp_path / "local")
+    local = start(cluster, "grid", "run", path, "--root", tmp_path / "local")
     assert "12 of 12 runs done" in local.communicate(timeout=200)[0]
     elsewhere = Grid(tmp_path / "local/small")
     assert metrics(elsewhere, elsewhere.manifest().runs()) == before
-    status = cluster.start("grid", "status", grid.folder, "--json")
+    status = start(cluster, "grid", "status", grid.folder, "--json")
     assert json.loads(status.communicate(timeout=60)[0])["counts"] == {"done": 12}
     assert status.returncode == 0
 
 
 @pytest.mark.parametrize("mode", ["jobs", "pool"])
-def test_a_killed_conductor_and_a_killed_submitter_change_nothing(
-    cluster: RayCluster, tmp_path: Path, mode: str
-) -> None:
+def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHead, tmp_path: Path, mode: str) -> None:
     path = write_grid(tmp_path, seeds={"count": 3})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", mode)
-    submitter = cluster.start(*submit)
+    submitter = start(cluster, *submit)
     grid = Grid(tmp_path / "runs/small")
     deadline = time.monotonic() + 120
 
@@ -167,7 +105,7 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(
     assert conductor, "no conductor was there to be killed"
     for process in conductor:
         process.kill()
-    again = cluster.start(*submit)
+    again = start(cluster, *submit)
     said = again.communicate(timeout=300)[0]
     assert again.returncode == 0, said
     assert "6 of 6 runs done" in said
@@ -180,8 +118,8 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(
         assert begun(grid, runs) == [1] * 6
 
 
-def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayCluster, tmp_path: Path) -> None:
-    work = cluster.start(
+def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayHead, tmp_path: Path) -> None:
+    work = start(cluster,
         "grid", "work", tmp_path, "0" * 12, "--seed", 0, "--attempt", 1, "--nonce", "ab", "--job", "x"
     )  # fmt: skip
     said = work.communicate(timeout=60)[0]
@@ -190,8 +128,8 @@ def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayCluster, tmp_path
     assert "Traceback" not in said
 
 
-def test_a_dead_job_server_is_one_clear_sentence(cluster: RayCluster, tmp_path: Path) -> None:
-    submit = cluster.start(
+def test_a_dead_job_server_is_one_clear_sentence(cluster: RayHead, tmp_path: Path) -> None:
+    submit = start(cluster,
         "grid", "submit", write_grid(tmp_path), "--address", "http://127.0.0.1:9", "--root", tmp_path / "runs"
     )  # fmt: skip
     said = submit.communicate(timeout=120)[0]

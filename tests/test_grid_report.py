@@ -20,6 +20,7 @@ from scipy import stats
 
 from space_dist.cli import main
 from space_dist.errors import ConfigError
+from space_dist.grid import plan
 from space_dist.ledger import Ledger, RunWriter
 from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
 from space_dist.report import build_grid_report
@@ -41,6 +42,7 @@ from space_dist.report.statistics import (
     stratified,
 )
 from space_dist.standing import Attempts, Cause, Ended
+from tests.grids import SMALL, write_grid
 from tests.test_report import GROWTH, continue_run, start_run
 
 START = (-10.0, -8.0, -6.0, -4.0)  # returns at steps 0 to 3,000; the fifth, at 4,000, is the final one
@@ -551,3 +553,12 @@ def test_an_unwritable_folder_is_one_sentence(grid: Grid, tmp_path: Path) -> Non
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
         build_grid_report(grid, tmp_path / "file")
+
+
+def test_policies_that_share_a_curriculum_are_one_sample(tmp_path: Path) -> None:
+    shared = {"curriculum.aggregate": "population", "curriculum.policies": 2}
+    settings = {**SMALL, **shared, "engine": "population", "budget.steps": 4096}
+    made = plan(write_grid(tmp_path, set=settings, seeds=[0]), tmp_path / "runs")
+    remarks = [line for line in build_grid_report(made.grid).remarks if "share one curriculum" in line]
+    assert [line.partition(":")[0] for line in remarks] == ["kappa=1", "kappa=4"]
+    assert all("fewer than 5 says little" in line for line in remarks)

@@ -6,15 +6,11 @@ import contextlib
 import dataclasses
 import os
 import shutil
-import signal
-import socket
 import sqlite3
-import subprocess
 import sys
 import threading
 import time
-import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +26,13 @@ from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunRe
 from space_dist.standing import Attempts, Cause, Ended
 from space_dist.tracking import NOTE_TAG, TrackingError, find, follow, sync
 from space_dist.tracking.grids import final_return
+from tests.grids import ROOT
 from tests.test_report import GROWTH, STARTED, continue_run, start_run
 from tests.test_tracking import contents, histories
+
+sys.path.append(str(ROOT / "jobs"))
+
+from benchmarks.servers import TrackingServer
 
 TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
 
@@ -81,6 +82,14 @@ def run_to(
     continue_run(ledger, [*TEST[:-1], last], GROWTH, until=until, state=state, success=0.5)
     attempts.end(attempt, Ended(None if state == "done" else Cause.PREEMPTED, "" if state == "done" else "SIGTERM"))
     return ledger
+
+
+def interrupted(folder: Path, uri: str, *seeds: int) -> Grid:
+    """A grid of one cell and two seeds; the runs of `seeds` were interrupted after their second evaluation."""
+    grid, _ = make_grid(folder, uri, etas=(0.1,))
+    for seed in seeds:
+        run_to(grid, 0, seed, until=1, state="interrupted")
+    return grid
 
 
 def everything(uri: str, experiment: str = "demo") -> tuple[MlflowRun, dict[str, MlflowRun]]:
@@ -186,8 +195,7 @@ def test_retries_and_resumed_runs_stay_the_children_they_were(uri: str, tmp_path
 
 
 def test_a_grid_whose_last_runs_failed_has_failed(uri: str, tmp_path: Path) -> None:
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    run_to(grid, 0, 0, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0)
     begin(grid, 0, 0, 2).end(2, Ended(Cause.OUT_OF_MEMORY, "600 MB"))
     begin(grid, 0, 1).end(1, Ended(Cause.OUT_OF_MEMORY, "700 MB"))
     sync([], grids=[grid])
@@ -198,9 +206,7 @@ def test_a_grid_whose_last_runs_failed_has_failed(uri: str, tmp_path: Path) -> N
 
 
 def test_what_was_deleted_in_mlflow_is_replayed_under_one_parent(uri: str, tmp_path: Path) -> None:
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    for seed in (0, 1):
-        run_to(grid, 0, seed, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0, 1)
     sync([], grids=[grid])
     parent, children = everything(uri)
     client = MlflowClient(uri)
@@ -216,9 +222,7 @@ def test_a_death_after_any_creation_doubles_nothing(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    for seed in (0, 1):
-        run_to(grid, 0, seed, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0, 1)
     create, calls = MlflowClient.create_run, 0
 
     def mortal(*args: Any, **keywords: Any) -> Any:
@@ -238,9 +242,7 @@ def test_a_death_after_any_creation_doubles_nothing(
 
 
 def test_two_pushers_take_turns(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    for seed in (0, 1):
-        run_to(grid, 0, seed, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0, 1)
     create = MlflowClient.create_run
 
     def slow(*args: Any, **keywords: Any) -> Any:
@@ -302,8 +304,7 @@ def test_following_a_grid_at_rest_asks_mlflow_nothing(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    run_to(grid, 0, 0, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0)
     rounds = 0
 
     def stop() -> bool:
@@ -327,8 +328,7 @@ def test_a_follower_takes_nothing_for_granted_after_an_outage(
     uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A store that has lost its runs meanwhile: everything is pushed again."""
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    run_to(grid, 0, 0, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0)
     rounds = 0
 
     def stop() -> bool:
@@ -379,8 +379,7 @@ def test_the_last_evaluation_is_read_from_the_end(tmp_path: Path) -> None:
 
 
 def test_damaged_runs_are_named_and_the_others_mirrored(uri: str, tmp_path: Path) -> None:
-    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
-    run_to(grid, 0, 0, until=1, state="interrupted")
+    grid = interrupted(tmp_path / "demo", uri, 0)
     bad = run_to(grid, 0, 1, until=1, state="interrupted")
     bad.status_file.write_text("{")
     result = sync([], grids=[grid])
@@ -423,34 +422,6 @@ def test_the_command_takes_a_grid_by_each_of_its_names(uri: str, tmp_path: Path)
 # ---- a real server --------------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def server(database: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """`mlflow server` on loopback, in a process group of its own, which is killed in the end."""
-    command = [
-        sys.executable, "-m", "mlflow", "server", "--backend-store-uri", f"sqlite:///{database}",
-        "--artifacts-destination", str(database.parent / "artifacts"), "--host", "127.0.0.1", "--port", str(port),
-        "--workers", "1", "--allowed-hosts", f"127.0.0.1:{port},localhost:{port}",
-    ]  # fmt: skip
-    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-    with (database.parent / "server.log").open("ab") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True, env=environment)
-    try:
-        until(lambda: process.poll() is not None or _healthy(port))
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def _healthy(port: int) -> bool:
-    try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=2) as answer:
-            return bool(answer.status == 200)
-    except OSError:
-        return False
-
-
 def points_of(ledger: Ledger) -> list[tuple[str, int, int, float]]:
     """(metric, milliseconds, step, value) of all a ledger's numbers, sorted; written for the test alone."""
     points = []
@@ -467,42 +438,37 @@ def points_of(ledger: Ledger) -> list[tuple[str, int, int, float]]:
 
 @pytest.mark.server
 def test_a_server_that_was_killed_in_the_middle_has_everything_once_after_a_sync(
-    empty_store: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    database = tmp_path / "mlflow.db"
-    shutil.copy(empty_store, database)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    grid, manifest = make_grid(tmp_path / "demo", f"http://127.0.0.1:{port}")
+    shutil.copy(empty_store, tmp_path / "mlflow.db")
+    server = TrackingServer(tmp_path, os.environ, tmp_path / "server.log")
+    grid, _ = make_grid(tmp_path / "demo", server.address)
     ledgers = [run_to(grid, cell, seed, last=cell + seed) for cell in (0, 1) for seed in (0, 1)]
     write, batches = MlflowClient.log_batch, 0
 
-    with server(database, port) as process, monkeypatch.context() as patch:
+    with server, monkeypatch.context() as patch:
 
         def fatal(*args: Any, **keywords: Any) -> Any:
             nonlocal batches
             batches += "metrics" in keywords
             if batches == 2:
-                os.killpg(process.pid, signal.SIGKILL)
+                server.kill()
             return write(*args, **keywords)
 
         patch.setattr(MlflowClient, "log_batch", fatal)
         patch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
         with pytest.raises(TrackingError, match="Nothing is lost"):
             sync([], grids=[grid])
-    with server(database, port):
+    with server:
         result = sync([], grids=[grid])
         assert (result.runs, result.failed) == (4, {})
         assert 0 < result.created < 4
-        parent, children = everything(manifest.tracking.uri or "")
+        parent, children = everything(server.address)
         assert sync([], grids=[grid]).rows == 0
     assert (parent.info.status, len(children)) == ("FINISHED", 4)
     assert "| eta=0.2 | `000000000001` | 1.5 | 1.5 | 1 | 2 | 2/2 |" in parent.data.tags[NOTE_TAG]
     assert {child.info.status for child in children.values()} == {"FINISHED"}
-    with contextlib.closing(sqlite3.connect(database)) as connection:
+    with contextlib.closing(sqlite3.connect(server.database)) as connection:
         for ledger in ledgers:
             folder = str(ledger.folder)
             stored = connection.execute(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,19 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig
 from space_dist.envs.interface import Step
-from space_dist.errors import Interrupted, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
-from space_dist.launch import Outcome, launch
+from space_dist.launch import Outcome, launch, policy_of, read_instances
+from space_dist.learner import CoupledLearner
 from space_dist.ledger import Ledger
+from space_dist.policy import members_of
 from space_dist.population import advance, member
-from tests.test_learners import LINE, N_STEPS, config_for, learner_section, results
+from space_dist.rollout import Walk, Worker
+from space_dist.training import learner_of, make_setup
+from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results
 from tests.tiny_env import Line
 
 DISCRETE = "tests.tiny_env:make_discrete"
@@ -159,3 +165,82 @@ def test_who_breaks_an_environment_fails_alone(tmp_path: Path) -> None:
     for number in (1, 2):
         assert isinstance(ends[folders[number]], Outcome)
         assert results(folders[number]) == alone(configs[number], tmp_path / f"alone{number}")
+
+
+# ---- policies that share a curriculum ----
+
+
+def coupled(folder: Path, **sections: Any) -> RunConfig:
+    curriculum = {"kind": "space", "eta": 0.5, "aggregate": "population", "policies": 3}
+    return config_for(
+        folder, learner_section("ppo"),
+        **{"curriculum": curriculum, "engine": "population", "budget": {"steps": 3 * ROUNDS * N_STEPS}, **sections},
+    )  # fmt: skip
+
+
+def test_policies_that_share_a_curriculum_are_one_run(tmp_path: Path) -> None:
+    """The same bytes alone, among others, interrupted; every policy's steps are counted."""
+    config, other = coupled(tmp_path), configured(tmp_path / "1", 1)
+    expected = alone(config, tmp_path / "alone")
+    status = Ledger(tmp_path / "alone").status()
+    assert (status.steps, status.round) == (3 * ROUNDS * N_STEPS, ROUNDS)
+    folders = [tmp_path / "run0", tmp_path / "run1"]
+    together([config, other], folders)
+    assert results(folders[0]) == expected
+    assert results(folders[1]) == alone(other, tmp_path / "alone1")
+    crashed(config, tmp_path / "crashed", 3)
+    assert alone(config, tmp_path / "crashed") == expected
+    seeds = {alone(config.model_copy(update={"seed": seed}), tmp_path / f"s{seed}")["model.npz"] for seed in (1, 2)}
+    assert len({*seeds, expected["model.npz"]}) == 3
+
+
+def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> None:
+    config = coupled(tmp_path)
+    setup = make_setup(config, *read_instances(config))
+    learner = learner_of(config)
+    assert isinstance(learner, CoupledLearner)
+    policy, worker = learner.policy(0), Worker(setup)
+    own = [worker.start_values(member, 0) for member in policy.members]
+    assert np.array_equal(worker.start_values(policy, 0), np.mean(own, axis=0))
+    assert not np.array_equal(own[0], own[1])
+    selection = make_curriculum(config, setup.train).start()[1]
+    asked = {"round": 0, "steps": 0, "selection_version": 0}
+    shards = [worker.collect(policy, selection, Walk(-1, ()), shard=number, **asked) for number in range(setup.shards)]
+    single = Worker(dataclasses.replace(setup, members=1))
+    for number, shard in enumerate(shards):  # each policy's own, with random numbers of its own
+        member = policy.members[number // 4]
+        again = single.collect(member, selection, Walk(-1, ()), shard=number, **asked)
+        assert np.array_equal(shard.actions, again.actions)
+    alone = learner_of(config)
+    assert isinstance(alone, CoupledLearner)
+    update = learner.update(shards, round=0, steps=3 * N_STEPS)
+    for member, mine in zip(alone.members, alone.parts(shards), strict=True):
+        made = member.update(mine, round=0, steps=3 * N_STEPS)
+        assert made.gradient_steps == update.gradient_steps
+    ours, theirs = learner.scored(), alone.scored()
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:
+    config = coupled(tmp_path, evaluation={"every_steps": 100, "episodes": 2})
+    alone(config, tmp_path / "run")
+    first = Ledger(tmp_path / "run").rows()[0]
+    learner, setup = learner_of(config), make_setup(config, *read_instances(config))
+    single = Worker(dataclasses.replace(setup, members=1, shards=1))
+    outcomes = [single.evaluate(member, "test", 0).returns.reshape(-1, 2).mean(axis=1)
+                for member in members_of(learner.policy(0))]  # fmt: skip
+    assert first["test"]["returns"] == pytest.approx(np.mean(outcomes, axis=0).tolist(), abs=1e-6)
+    assert len(members_of(policy_of(Ledger(tmp_path / "run")))) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"engine": "single"}, "needs engine: population"),
+     ({"learner": learner_section("trpo")}, "learner.kind: ppo"),
+     ({"learner": learner_section("ppo", normalize_rewards=True)}, "normalize_rewards")],
+)  # fmt: skip
+def test_who_cannot_share_a_curriculum_is_told_so(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
+    learner = changes.pop("learner", learner_section("ppo"))
+    curriculum = {"kind": "space", "aggregate": "population"}
+    with pytest.raises(ConfigError, match=words):
+        config_for(tmp_path, learner, **{"curriculum": curriculum, "engine": "population", **changes})

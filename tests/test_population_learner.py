@@ -99,7 +99,7 @@ class Watched:
         def watch(self: PPO) -> None:
             stack = self._stack
             before = stack.gradient.clone()
-            active = self._adam.active.tolist()
+            active = list(self._active)
             step(self)
             for index, mine in enumerate(steps):
                 if active[index]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import random
 import re
 import shutil
 import signal
@@ -28,6 +27,7 @@ from space_dist.slurm.node import address_facing
 from space_dist.slurm.profile import seconds
 from space_dist.slurm.queue import queue_of
 from space_dist.standing import Cause, Ended, slurm_job, unheard
+from tests.slurm.profiles import exports
 
 ROOT = Path(__file__).resolve().parent.parent
 GRID, SITE = ROOT / "configs/grids/pointmass_small.yaml", ROOT / "configs/slurm/site.yaml"
@@ -409,21 +409,9 @@ def test_a_profile_line_is_one_line() -> None:
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
 def test_bash_and_shellcheck_object_to_no_script(manifest: Manifest, tmp_path: Path) -> None:
-    chance = random.Random(0)
     files = []
-    for number in range(12):
-        options = _everything().model_dump(exclude_unset=True)
-        kept = {name: value for name, value in options.items() if chance.random() < 0.5}
-        if "apptainer" not in kept:
-            kept.pop("apptainer_options", None)
-        if chance.random() < 0.3:
-            kept.pop("conda", None)
-            kept["venv"] = "/a folder/it's"
-        mode: Mode = chance.choice(MODES)
-        if mode == "array":
-            kept |= {"cells_per_task": chance.randint(1, 4), "max_array_size": chance.choice([2, 1001])}
-        root = chance.choice([None, Path("/scratch/it's mine")])
-        folder = write(Export(manifest, profile(**kept), mode, root), tmp_path / str(number))
+    for number, made in enumerate(exports(manifest, 24)):
+        folder = write(made, tmp_path / str(number))
         files += [folder / name for name in (TRAIN, AGGREGATE, SUBMIT)]
     for example in EXAMPLES.glob("*/*.s*"):
         files.append(example)
@@ -537,21 +525,29 @@ def _await(path: Path) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize(("number", "requeued"), [(signal.SIGUSR1, True), (signal.SIGTERM, False)])
+@pytest.mark.parametrize(
+    ("number", "reason", "requeued"),
+    [(signal.SIGUSR1, "", True), (signal.SIGTERM, "None", False), (signal.SIGTERM, "TimeLimit", True)],
+)
 def test_a_signal_becomes_a_flag_file(
-    number: signal.Signals, requeued: bool, manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+    number: signal.Signals, reason: str, requeued: bool, manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
 ) -> None:
     folder = write(Export(manifest, profile(temp=short), "array"), tmp_path / "x")
     waits = tmp_path / "waits"
-    process = stubs.start(folder / TRAIN, STUB_WAITS=str(waits), STUB_FLAG=f"{short}/r17/stop", STUB_CODE="75")
+    process = stubs.start(
+        folder / TRAIN, STUB_WAITS=str(waits), STUB_FLAG=f"{short}/r17/stop", STUB_CODE="75", STUB_QUEUE=reason
+    )
     _await(waits)
     for _ in range(20):  # it may come more than once, at any moment
         process.send_signal(number)
         time.sleep(0.002)
     out, err = process.communicate(timeout=30)
     assert process.returncode == 75, err
-    assert ("requeued" in out.split("checkpoints")[0]) is requeued
-    assert bool(stubs.calls("scontrol")) is requeued
+    assert ("interrupted; requeued for the 1. time" in out) is requeued
+    calls = stubs.calls()
+    assert [call[1:] for call in calls if call[0] == "scontrol"] == ([["requeue", "7_0"]] if requeued else [])
+    asked = [call[-1] for call in calls if call[0] == "squeue"]
+    assert asked == (["--jobs=7_0"] if number == signal.SIGTERM else [])
     assert list((tmp_path / "node").iterdir()) == []
 
 

@@ -23,8 +23,13 @@ from space_dist.config import to_yaml
 from space_dist.ledger import METRICS, Ledger
 from space_dist.manifest import Grid
 from space_dist.slurm import Export, Profile
-from space_dist.slurm.export import AGGREGATE, JOBS, render
+from space_dist.slurm import export as write_scripts
+from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
+from space_dist.standing import Attempts
 from tests.slurm.gated_env import GATE
+from tests.slurm.profiles import FIELDS, RESERVATION, exports
+from tests.test_grid_tracking import everything
+from tests.test_tracking import histories
 
 ROOT = Path(__file__).resolve().parent.parent
 HERE = ROOT / "tests/slurm"
@@ -191,13 +196,18 @@ def hosts(folder: Path) -> set[str]:
     return {row["where"]["host"] for row in rows if row["event"] == "begin"}
 
 
-def test_an_array_survives_preemption_and_its_time_limit(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
-    gate = tmp_path / "gate"
+def test_an_array_survives_preemption_and_its_time_limit(
+    slurm: Slurm, reference: Grid, empty_store: Path, tmp_path: Path
+) -> None:
+    gate, database = tmp_path / "gate", tmp_path / "mlflow.db"
     gate.touch()  # runs are slow until all that is to happen has happened
+    shutil.copy(empty_store, database)
+    grid_file = write_grid(
+        tmp_path / "written", "eight", seeds=(0, 1), grid={"curriculum": list(KINDS)},
+        tracking={"uri": f"sqlite:///{database}"},
+    )  # fmt: skip
     # Exported, and then copied elsewhere, as a user would: with nothing but what is in the folder.
-    made = export(
-        reference.folder, tmp_path / "out", gate, "--cells-per-task", 2, "--throttle", 3, "--check", slurm=slurm
-    )
+    made = export(grid_file, tmp_path / "out", gate, "--cells-per-task", 2, "--throttle", 3, "--check", slurm=slurm)
     folder = tmp_path / "else where" / "grid"
     shutil.copytree(made, folder)
     shutil.rmtree(made)
@@ -213,23 +223,37 @@ def test_an_array_survives_preemption_and_its_time_limit(slurm: Slurm, reference
     for element in (0, 1, 2):
         await_run(element)
     assert slurm.job(names[3])["JobState"] == "PENDING"  # the throttle
-    hours, minutes, seconds = map(int, slurm.job(names[2])["RunTime"].split(":"))
-    limit = (3600 * hours + 60 * minutes + seconds + 110) // 60  # so that its end is near all of a sudden
-    slurm.ask("scontrol", "update", f"JobId={names[2]}", f"TimeLimit={limit}")
+    slurm.ask("scontrol", "update", f"JobId={names[2]}", "EndTime=now+110")  # which SLURM announces
     slurm.ask("scontrol", "requeue", names[0])
     slurm.ask("scontrol", "requeue", names[1])
     await_run(3)
     slurm.ask("scancel", "--batch", "--signal=USR1", names[3])
-    for name in names:
-        await_(lambda name=name: slurm.job(name).get("Restarts") == "1", f"{name} to be requeued", folder)
-    slurm.ask("scontrol", "update", f"JobId={names[2]}", "TimeLimit=UNLIMITED")
+    await_(lambda: any(Attempts(grid.ledger(run)).history().begun == 2 for run in runs[:2]), "0 to be back", folder)
+    slurm.ask("scontrol", "update", f"JobId={names[0]}", "EndTime=now")  # without notice
+    for name, restarts in zip(names, "2111", strict=True):
+        await_(lambda: slurm.job(name).get("Restarts") == restarts, f"{name} to be requeued", folder)  # noqa: B023
     gate.unlink()
     assert await_end(slurm, aggregate, folder) == "COMPLETED"
     assert [slurm.job(name)["JobState"] for name in names] == ["COMPLETED"] * 4
+    told = [(folder / f"logs/eight-{name}.out").read_text() for name in names]
+    assert ["ended at its time limit, without notice" in text for text in told] == [True, False, False, False]
+    assert "interrupted; requeued for the 2. time" in told[0]
     said = (folder / f"logs/eight-aggregate-{aggregate}.out").read_text()
     assert "eight: 8 of 8 runs done" in said
+    assert "8 runs are up to date in MLflow (8 new" in said
     assert any((folder / "report").iterdir())
     assert_same_results(folder, reference)
+    _, children = everything(f"sqlite:///{database}", "eight")
+    assert {child.data.tags["space_dist.folder"] for child in children.values()} == {
+        str(grid.ledger(run).folder) for run in runs
+    }
+    for child in children.values():
+        assert child.info.status == "FINISHED"
+        ledger = Ledger(Path(child.data.tags["space_dist.folder"]))
+        evaluations = [(row["steps"], row["test"]["return"]) for row in ledger.rows() if row["kind"] == "evaluation"]
+        stored = histories(f"sqlite:///{database}", child)["test/return"]
+        assert [(step, value) for step, _, value in stored] == evaluations
+    assert "(0 new, 0 rows pushed)" in space_dist("sync", folder)
     for node in (1, 2):
         await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
 
@@ -289,3 +313,31 @@ def test_sbatch_reads_hostile_values_as_text(slurm: Slurm, reference: Grid, tmp_
         slurm.ask("scancel", job)
         assert f"Comment={value}" in [line.strip() for line in shown.splitlines()], shown
     assert list(tmp_path.glob("**/canary")) == []
+
+
+def test_sbatch_accepts_every_drawn_profile(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:
+    def objection(folder: Path, script: str) -> str:
+        done = subprocess.run(
+            ["sbatch", "--test-only", script], cwd=folder, env=slurm.environment, text=True, capture_output=True,
+            timeout=60,
+        )  # fmt: skip
+        assert (done.returncode == 0) is ("to start at" in done.stderr), done.stderr
+        return "" if done.returncode == 0 else done.stderr
+
+    manifest, made = reference.manifest(), exports(reference.manifest(), 40)
+    assert {name for one in made for name in one.profile.model_fields_set} == FIELDS | {"apptainer_options"}
+    with contextlib.ExitStack() as stack:
+        for number, one in enumerate(sorted(made, key=lambda one: one.profile.reservation or "")):
+            if one.profile.reservation is not None and RESERVATION not in slurm.ask("scontrol", "show", "reservation"):
+                slurm.ask("scontrol", "create", "reservation", f"ReservationName={RESERVATION}", "StartTime=now",
+                          "Duration=UNLIMITED", "Users=root", "Nodes=n[1-2]", "Flags=IGNORE_JOBS")  # fmt: skip
+                stack.callback(slurm.ask, "scontrol", "delete", f"ReservationName={RESERVATION}")
+            write_scripts(one, reference.instance_files(manifest), tmp_path / str(number))
+            for script in (TRAIN, AGGREGATE):
+                said = objection(tmp_path / str(number), script)
+                assert not said, (one.profile.model_dump(exclude_unset=True), script, said)
+    assert list(tmp_path.glob("**/canary")) == []
+    for wrong, what in (({"partition": "nowhere"}, "partition"), ({"nodelist": "n7"}, "node"), ({"mem": "99G"}, "")):
+        refused = Export(manifest, Profile.model_validate(wrong), "array")
+        write_scripts(refused, reference.instance_files(manifest), tmp_path / "wrong")
+        assert what in objection(tmp_path / "wrong", TRAIN) != ""

@@ -18,6 +18,7 @@ from mlflow.entities import Run
 from space_dist.errors import ConfigError
 from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
 from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, follow, sync
+from space_dist.tracking import runs as tracked_runs
 from tests.test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
 
 TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
@@ -143,7 +144,8 @@ def test_more_rows_than_one_call_takes(uri: str, tmp_path: Path) -> None:
 def test_a_death_after_any_call_is_made_good(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Die right after the 1st, 2nd, ... call that writes, until one push survives; then everything must be there."""
     ledger = start_run(tmp_path / "run")
-    continue_run(ledger, [float(n) for n in range(61)], [[0]] * 60)  # two calls' worth of metrics
+    monkeypatch.setattr(tracked_runs, "_MAX_METRICS", 100)
+    continue_run(ledger, [float(n) for n in range(7)], [[0]] * 6)  # two calls' worth of metrics
     sync([ledger], uri, "reference")
     reference = only_run(uri, "reference")
     points, calls, deaths = histories(uri, reference), 0, 0

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import filecmp
+import functools
 import json
 import os
 import secrets
@@ -24,9 +25,10 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 import psutil
@@ -51,6 +53,13 @@ KINDS = (
 )  # fmt: skip
 OF_ALL = ("conductor", "submitter", "Ray head", "tracking server")  # parts that all runs share
 AT_A_TIME = 2  # runs, each with a driver, a rollout actor and a curriculum actor
+BASE = ROOT / "configs/pointmass_space.yaml"
+SETTINGS: Mapping[str, Any] = {
+    "learner.n_steps": 1024,
+    "learner.n_epochs": 3,
+    "rollout.slots": 2,
+    "evaluation.every_steps": 10_240,
+}
 _FIRST, _LAST = 0.03, 0.9  # of all steps: when the first and the last fault may fall
 _MOST_DELAY, _MOST_PAUSE = 2.0, 3.0  # seconds: after the step count that calls for a fault; before a restart
 _FURTHER_ROUNDS = 2  # that a run must commit after a fault: the first may have been computed when it fell
@@ -99,12 +108,15 @@ class Result:
     seconds: float = 0.0
 
 
-def plan(kinds: Sequence[str], count: int, steps: int, seed: int) -> list[Fault]:
-    """`count` faults over a grid of `steps` environment steps, every kind as often as any other, give or take one."""
+def plan(kinds: Sequence[str], count: int, steps: int, seed: int, last: float = _LAST) -> list[Fault]:
+    """`count` faults over a grid of `steps` environment steps, every kind as often as any other, give or take one.
+
+    last: by which share of the steps all have fallen.
+    """
     draws = np.random.default_rng(np.random.SeedSequence(seed))
     chosen = [kinds[number % len(kinds)] for number in range(count)]
     draws.shuffle(chosen)
-    moments = np.sort(draws.uniform(_FIRST * steps, _LAST * steps, count))
+    moments = np.sort(draws.uniform(_FIRST * steps, last * steps, count))
     return [
         Fault(kind, float(moment), float(draws.uniform(0.0, _MOST_DELAY)), float(draws.uniform(0.0, _MOST_PAUSE)),
               float(draws.random()))
@@ -132,9 +144,15 @@ def chaos(
 
 
 def rehearse(
-    *, runs: int, steps: int, seed: int, kinds: Sequence[str], count: int, say: Callable[[str], None]
-) -> Result:
-    """Work on one grid twice, once left alone and once not; returns what was found."""
+    *, runs: int, steps: int, seed: int, kinds: Sequence[str], count: int, say: Callable[[str], None],
+    base: Path = BASE, settings: Mapping[str, Any] = SETTINGS, last: float = _LAST,
+    after_faults: Callable[[], None] = lambda: None,
+) -> Result:  # fmt: skip
+    """Work on one grid twice, once left alone and once not; returns what was found.
+
+    base, settings: the config of its runs, and what is changed of it. last: see `plan`. after_faults: called when all
+    faults have fallen.
+    """
     mark = secrets.token_hex(8)
     folder = Path(tempfile.mkdtemp(prefix="sd", dir="/tmp"))
     (folder / "tmp").mkdir()
@@ -145,14 +163,16 @@ def rehearse(
     result = Result(runs=runs)
     try:
         with contextlib.ExitStack() as stack:
-            server = stack.enter_context(TrackingServer(folder, environment, folder / "server.log"))
-            head = stack.enter_context(RayHead(folder / "ray", AT_A_TIME * 2, environment, folder / "head.log"))
-            alone = stack.enter_context(_alone(folder, runs, steps, environment))
-            rehearsal = _Rehearsal(folder, _grid_file(folder, "chaos", runs, steps, server.address), head, server,
-                                   mark, result, say)  # fmt: skip
+            server = TrackingServer(folder, environment, folder / "server.log")
+            head = RayHead(folder / "ray", AT_A_TIME * 2, environment, folder / "head.log")
+            with ThreadPoolExecutor() as pool:
+                list(pool.map(stack.enter_context, (server, head)))
+            write = functools.partial(_grid_file, folder, runs, {**settings, "budget.steps": steps}, base)
+            alone = stack.enter_context(_alone(folder, write("alone", None), environment))
+            rehearsal = _Rehearsal(folder, write("chaos", server.address), head, server, mark, result, say)
             start = time.monotonic()
             try:
-                rehearsal.run(plan(kinds, count, runs * steps, seed))
+                rehearsal.run(plan(kinds, count, runs * steps, seed, last), after_faults)
                 result.seconds = time.monotonic() - start
                 rehearsal.check(_finished(alone, folder))
             finally:
@@ -183,15 +203,13 @@ def _temporary(folder: Path) -> list[str]:
     return [name for name in found if not name.startswith(others)]
 
 
-def _grid_file(folder: Path, name: str, runs: int, steps: int, uri: str | None) -> Path:
+def _grid_file(
+    folder: Path, runs: int, settings: Mapping[str, Any], base: Path, name: str, uri: str | None
+) -> Path:  # fmt: skip
     path = folder / f"{name}.yaml"
     cells = 2 if runs % 2 == 0 else 1
     path.write_text(configs.to_yaml({
-        "name": "chaos", "extends": str(ROOT / "configs/pointmass_space.yaml"),
-        "set": {
-            "budget.steps": steps, "learner.n_steps": 1024, "learner.n_epochs": 3, "rollout.slots": 2,
-            "evaluation.every_steps": 10_240, "checkpoint.every_rounds": 1,
-        },
+        "name": "chaos", "extends": str(base), "set": {**settings, "checkpoint.every_rounds": 1},
         "grid": {"curriculum.kappa": [1, 16][:cells]}, "seeds": {"count": runs // cells},
         "resources": {
             "workers": 0 if uri is None else 1, "grace_seconds": 5.0, "late_seconds": 6.0,
@@ -203,13 +221,11 @@ def _grid_file(folder: Path, name: str, runs: int, steps: int, uri: str | None) 
 
 
 @contextlib.contextmanager
-def _alone(
-    folder: Path, runs: int, steps: int, environment: Mapping[str, str]
-) -> Iterator[subprocess.Popen[bytes]]:  # fmt: skip
+def _alone(folder: Path, grid_file: Path, environment: Mapping[str, str]) -> Iterator[subprocess.Popen[bytes]]:
     """The grid without faults, actors and MLflow, worked on at the same time."""
     command = [
-        sys.executable, "-m", "space_dist.cli", "grid", "run", str(_grid_file(folder, "alone", runs, steps, None)),
-        "--root", str(folder / "alone"), "--max-parallel", "1",
+        sys.executable, "-m", "space_dist.cli", "grid", "run", str(grid_file), "--root",
+        str(folder / "alone"), "--max-parallel", "1",
     ]  # fmt: skip
     with (folder / "alone.log").open("wb") as output:
         process = subprocess.Popen(
@@ -278,7 +294,7 @@ class _Rehearsal:
 
     # ---- the course of things ----
 
-    def run(self, faults: Sequence[Fault]) -> None:
+    def run(self, faults: Sequence[Fault], after_faults: Callable[[], None]) -> None:
         """All faults, and the rest of the work."""
         self._submit()
         for fault in faults:
@@ -289,6 +305,7 @@ class _Rehearsal:
                     f"no target for {fault.kind!r} was found in the middle of its work (--steps makes more of it)"
                 )
                 self._say(f"        {fault.kind}: no target")
+        after_faults()
         if not self._wait(lambda: self._submitter is not None and self._submitter.poll() == 0):
             self._result.faults.append("the grid did not complete")
         self._wait(lambda: not self._open)

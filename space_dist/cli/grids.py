@@ -16,13 +16,15 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from space_dist.cli.terminal import STOP, console, say, warn
-from space_dist.errors import ConfigError, SpaceDistError, nearest
+from space_dist.cli.terminal import STOP, Json, console, one_of, say, warn
+from space_dist.errors import ConfigError, SpaceDistError
 
 if TYPE_CHECKING:
+    from ray.job_submission import JobDetails
+
     from space_dist.grid import Overview
     from space_dist.manifest import Grid, Manifest, Run
-    from space_dist.ray_jobs import Mode
+    from space_dist.ray_jobs import Mode, Remote
     from space_dist.slurm.queue import Queue
     from space_dist.standing import Standing
 
@@ -36,7 +38,10 @@ Root = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads annotations at run time
     typer.Option(help="Folder that holds the grids' folders. Default: runs; within a Ray job ~/space_dist/runs."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+JobServer = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(help="The cluster's job server, where its storage is not seen from here."),
+]
 Seed = Annotated[int, typer.Option(help="The run's seed.")]
 
 _MODES = ("auto", "pool", "jobs")
@@ -175,18 +180,13 @@ def grid_status(
     watch: Annotated[bool, typer.Option("--watch", help="Go on showing until nothing is left to do.")] = False,
     as_json: Json = False,
     by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
-    address: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="The cluster's job server, where its storage is not seen from here."),
-    ] = None,
+    address: JobServer = None,
 ) -> None:
     """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
-    from space_dist.manifest import find_grid
     from space_dist.slurm.queue import queue_of
     from space_dist.standing import exit_code
 
-    place = find_grid(grid, _root(root))
-    manifest = place.manifest()
+    place, manifest = _found(grid, root)
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
     queue, asked = queue_of(place.folder), time.monotonic()
@@ -216,11 +216,9 @@ def grid_logs(
     follow: Annotated[bool, typer.Option("--follow", help="Go on until the run has ended.")] = False,
 ) -> None:
     """What one run has said."""
-    from space_dist.manifest import find_grid
     from space_dist.supervisor import OUTPUT
 
-    place = find_grid(grid, _root(root))
-    manifest = place.manifest()
+    place, manifest = _found(grid, root)
     run = manifest.run(cell, seed)
     ledger = place.ledger(run)
     offsets = {ledger.log: 0, ledger.folder / OUTPUT: 0}
@@ -240,24 +238,14 @@ def grid_logs(
 def grid_stop(
     grid: GridPath,
     root: Root = None,
-    address: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="The cluster's job server, where its storage is not seen from here."),
-    ] = None,
+    address: JobServer = None,
 ) -> None:
     """Have all runs make a checkpoint and end. Running or submitting the grid again goes on from there."""
-    from space_dist.manifest import find_grid
     from space_dist.slurm.queue import queue_of
 
-    place = find_grid(grid, _root(root))
-    manifest = place.manifest()
+    place, manifest = _found(grid, root)
     if address is not None:
-        from space_dist.ray_jobs import Remote
-
-        remote = Remote(address, manifest, place.folder.parent)
-        conductor = remote.conductor()
-        if conductor is None:
-            raise SpaceDistError(f"{address} knows no conductor of {manifest.name}")
+        remote, conductor = _conductor(place, manifest, address)
         remote.stop(str(conductor.submission_id))
         say(f"{manifest.name}: job {conductor.submission_id} was asked to stop its runs, and itself")
         return
@@ -281,15 +269,13 @@ def grid_retry(
     root: Root = None,
 ) -> None:
     """Let failed runs be tried again, whatever the grid's `retry` says; they go on from their checkpoints."""
-    from space_dist.manifest import find_grid
     from space_dist.standing import Attempts, Cause
 
     known = [one.value for one in Cause]
     causes = {name.strip().replace("-", "_") for text in cause for name in text.split(",")}
-    for name in causes - {*known}:
-        raise ConfigError(f"--cause {name!r} is not known{nearest(name, known)} Allowed: {', '.join(known)}")
-    place = find_grid(grid, _root(root))
-    manifest = place.manifest()
+    for name in sorted(causes):
+        one_of(known, name, "--cause")
+    place, manifest = _found(grid, root)
     chosen = [standing for standing in _standings(place, manifest)
               if standing.condition == "failed" and standing.cause in causes]  # fmt: skip
     for standing in chosen:
@@ -384,10 +370,16 @@ def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
     return made.grid, made.manifest
 
 
+def _found(path: Path, root: Path | None) -> tuple[Grid, Manifest]:
+    """A grid that was frozen before, however the user names it."""
+    from space_dist.manifest import find_grid
+
+    place = find_grid(path, _root(root))
+    return place, place.manifest()
+
+
 def _mode(text: str) -> Mode:
-    if text in ("auto", "pool", "jobs"):
-        return cast("Mode", text)
-    raise ConfigError(f"--mode {text!r} is not known{nearest(text, _MODES)} Allowed: {', '.join(_MODES)}")
+    return cast("Mode", one_of(_MODES, text, "--mode"))
 
 
 def _number(text: str, option: str) -> int:
@@ -554,14 +546,20 @@ def _status_json(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> 
     }  # fmt: skip
 
 
-def _remote_status(place: Grid, manifest: Manifest, address: str) -> int:
-    """What the job server knows, where the ledgers are not seen from here."""
+def _conductor(place: Grid, manifest: Manifest, address: str) -> tuple[Remote, JobDetails]:
+    """The job that conducts a grid on the cluster at `address`. Raises SpaceDistError if there was none."""
     from space_dist.ray_jobs import Remote
 
     remote = Remote(address, manifest, place.folder.parent)
     conductor = remote.conductor()
     if conductor is None:
         raise SpaceDistError(f"{address} knows no conductor of {manifest.name}")
+    return remote, conductor
+
+
+def _remote_status(place: Grid, manifest: Manifest, address: str) -> int:
+    """What the job server knows, where the ledgers are not seen from here."""
+    remote, conductor = _conductor(place, manifest, address)
     lines = [line for line in remote.logs(str(conductor.submission_id)).splitlines() if line.strip()]
     say(f"job {conductor.submission_id}: {conductor.status.value.lower()}")
     for line in lines[-5:]:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from space_dist.cli.terminal import STOP, Overrides, console, say, warn, write
+from space_dist.cli.terminal import STOP, Json, Overrides, console, say, warn, write
 from space_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def evaluate(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Also write every instance's results to this CSV."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
@@ -76,6 +76,7 @@ def evaluate(
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of, stored_config
     from space_dist.ledger import Ledger
+    from space_dist.policy import members_of
     from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
@@ -84,20 +85,21 @@ def evaluate(
     ledger = Ledger(run)
     status = ledger.status()
     config = stored_config(ledger)
-    policy = policy_of(ledger)
+    policies = members_of(policy_of(ledger))
     chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
     env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    (outcome,) = evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])
-    columns = {
-        "return": outcome.returns, "discounted_return": outcome.discounted_returns, "length": outcome.lengths,
-        "success": outcome.success,
-    }  # fmt: skip
+    outcomes = [evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])[0]
+                for policy in policies]  # fmt: skip
+    names = {"return": "returns", "discounted_return": "discounted_returns", "length": "lengths", "success": "success"}
+    columns = {  # over all policies, where the run trains several
+        column: np.mean([getattr(outcome, name) for outcome in outcomes], axis=0) for column, name in names.items()
+    }
     if isinstance(world := unwrapped(env), KnowsOptimum):
         columns["optimal_return"] = world.optimal_returns(chosen.contexts)
     means = {name: None if np.isnan(values).all() else float(np.mean(values)) for name, values in columns.items()}
     if "optimal_return" in columns:  # a share of sums: no single episode's return need be positive
-        means["share_of_optimum"] = float(outcome.returns.sum() / columns["optimal_return"].sum())
+        means["share_of_optimum"] = float(columns["return"].sum() / columns["optimal_return"].sum())
     if out is not None:
         rows = zip(chosen.ids.tolist(), *(values.tolist() for values in columns.values()), strict=True)
         lines = [f"id,{','.join(columns)}", *(",".join(map(str, row)) for row in rows)]

@@ -12,13 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Optional, cast
 import typer
 
 from space_dist.cli.grids import GridPath
-from space_dist.cli.terminal import say, warn
-from space_dist.errors import ConfigError, SpaceDistError, nearest
+from space_dist.cli.terminal import one_of, say, warn
+from space_dist.errors import ConfigError, SpaceDistError
 
 if TYPE_CHECKING:
     from space_dist.manifest import Manifest
+    from space_dist.slurm import Mode
 
 slurm_app = typer.Typer(no_args_is_help=True, help="The same grid as SLURM scripts.")
+
+Interface = Annotated[Optional[str], typer.Option()]  # noqa: UP045 - typer reads annotations at run time
 
 _MODES = ("array", "cluster")
 _SECONDS = 60.0
@@ -60,10 +63,9 @@ def slurm_export(
     check: Annotated[bool, typer.Option("--check", help="Also have bash, shellcheck and sbatch look at them.")] = False,
 ) -> None:
     """Write a grid as scripts that train it, check and report on it, with the exact commands. The same, every time."""
-    from space_dist.slurm import Export, Mode, export, load_profile
+    from space_dist.slurm import Export, export, load_profile
 
-    if mode not in _MODES:
-        raise ConfigError(f"--mode {mode!r} is not known{nearest(mode, _MODES)} Allowed: {', '.join(_MODES)}")
+    chosen = cast("Mode", one_of(_MODES, mode, "--mode"))
     if templates is not None and not templates.is_dir():
         raise ConfigError(f"--templates {templates} is no folder")
     settings = list(overrides or [])
@@ -71,7 +73,7 @@ def slurm_export(
     settings += [] if cells_per_task is None else [f"cells_per_task={cells_per_task}"]
     site = load_profile(profile, settings)
     manifest, instances = _frozen(grid)
-    made = Export(manifest, site, cast("Mode", mode), None if root is None else root.absolute())
+    made = Export(manifest, site, chosen, None if root is None else root.absolute())
     for path in export(made, instances, out, templates):
         say(str(path))
     tasks = f"{made.n_tasks} array tasks" if mode == "array" else f"one job of {site.nodes} nodes"
@@ -94,7 +96,7 @@ def slurm_submit(folder: Annotated[Path, typer.Argument(metavar="DIR", help="An 
 @slurm_app.command("address", hidden=True)
 def slurm_address(
     peer: Annotated[str, typer.Option(help="A node that must reach this one.")],
-    interface: Annotated[Optional[str], typer.Option()] = None,  # noqa: UP045
+    interface: Interface = None,
 ) -> None:
     """Print the address by which this node is to be known to the others."""
     from space_dist.slurm.node import address_facing
@@ -108,7 +110,7 @@ def slurm_node(
     port: Annotated[int, typer.Option(min=1024, max=65000)],
     cpus: Annotated[int, typer.Option(min=1)],
     temp: Annotated[Path, typer.Option()],
-    interface: Annotated[Optional[str], typer.Option()] = None,  # noqa: UP045
+    interface: Interface = None,
 ) -> None:
     """Be one node of a job's Ray, until asked to end."""
     from space_dist.slurm.node import serve

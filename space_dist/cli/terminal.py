@@ -15,13 +15,14 @@ from space_dist.interrupts import StopRequests
 
 STOP = StopRequests()
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 from rich.console import Console
 
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, nearest
 
 console = Console()
 errors = Console(stderr=True)
@@ -36,6 +37,8 @@ Kwargs = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
     typer.Option("--kwarg", metavar="NAME=VALUE", help="An argument of the environment (env.kwargs). Repeatable."),
 ]
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def say(text: str) -> None:
@@ -55,6 +58,13 @@ def write(path: Path, text: str) -> None:
         path.write_text(text)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+
+
+def one_of(allowed: Sequence[str], text: str, option: str) -> str:
+    """`text`, which an option was given. Raises ConfigError if it is not allowed."""
+    if text not in allowed:
+        raise ConfigError(f"{option} {text!r} is not known{nearest(text, allowed)} Allowed: {', '.join(allowed)}")
+    return text
 
 
 def parse_kwargs(given: list[str] | None) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from space_dist.config import (
     ValueDisagreementConfig,
 )
 from space_dist.errors import ConfigError
+from space_dist.learner.coupled import CoupledLearner
 from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
@@ -87,6 +88,7 @@ def make_ensemble(config: RunConfig, observation_space: spaces.Space[Any], featu
 
 __all__ = [
     "Arrays",
+    "CoupledLearner",
     "Ensemble",
     "Learner",
     "OffPolicyLearner",

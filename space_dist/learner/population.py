@@ -120,7 +120,7 @@ class PopulationLearner(OnPolicyLearner):
             "approx_kl": made.divergences[made.last_epoch :].mean(),
             "clip_fraction": made.clip_fractions.mean(),
             "loss": policy[-1] + config.ent_coef * entropy[-1] + config.vf_coef * value[-1],
-            "explained_variance": explained_variance(collected.values.flatten(), collected.returns.flatten()),
+            "explained_variance": explained_variance(_flat(collected.values), _flat(collected.returns)),
             "n_updates": model._n_updates,
             "clip_range": config.clip_range,
         }

@@ -176,11 +176,18 @@ class Networks:
             return torch.zeros(count, *sizes, device=stack.device, dtype=stack.dtype)
 
         self._hidden = [empty(rows, n) for n in shape.hidden]
-        self._hidden_gradients = [empty(rows, n) for n in shape.hidden]
+        # Where a layer above is done with its units when this one's gradient comes, that lies where it is in the cache.
+        above = itertools.zip_longest(shape.hidden, self._hidden[1:])
+        self._hidden_gradients = [
+            empty(rows, n) if units is None or units.shape[2] != n else units for n, units in above
+        ]  # fmt: skip
         self._scratch = [empty(*place.shape) for place in layout.weights]
-        self._transposed = [empty(n_out, n_in) for n_in, n_out in zip(shape.sizes[:-2], shape.sizes[1:-1], strict=True)]
         self.outputs = empty(shape.outputs, rows)
         self.output_gradients = empty(shape.outputs, rows)
+        self._weights_turned, self._hidden_turned, self._output_gradients_turned = (
+            [tensor.transpose(1, 2) for tensor in tensors]
+            for tensors in (self._weights, self._hidden, [self.output_gradients])
+        )
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """`(R, rows, inputs) -> (R, outputs, rows)`, in `outputs`."""
@@ -191,7 +198,8 @@ class Networks:
             else:
                 torch.relu_(hidden)
             inputs = hidden
-        return torch.baddbmm(self._biases[-1], self._weights[-1], inputs.transpose(1, 2), out=self.outputs)
+        turned = self._hidden_turned[-1] if self._hidden else inputs.transpose(1, 2)
+        return torch.baddbmm(self._biases[-1], self._weights[-1], turned, out=self.outputs)
 
     def backward(self, inputs: torch.Tensor) -> None:
         """Write the gradient of every weight, given `output_gradients`, of the last `forward`'s `inputs`."""
@@ -203,16 +211,15 @@ class Networks:
         for layer in reversed(range(len(self._hidden))):
             gradient, hidden = self._hidden_gradients[layer], self._hidden[layer]
             if layer == len(self._hidden) - 1:
-                torch.bmm(given.transpose(1, 2), self._weights[-1], out=gradient)
-            else:  # twice as fast as the product with a transposed view
-                self._transposed[layer + 1].copy_(self._weights[layer + 1].transpose(1, 2))
-                torch.bmm(given, self._transposed[layer + 1], out=gradient)
+                torch.bmm(self._output_gradients_turned[0], self._weights[-1], out=gradient)
+            else:
+                torch.bmm(given, self._weights_turned[layer + 1], out=gradient)
             if self._tanh:
                 torch.ops.aten.tanh_backward.grad_input(gradient, hidden, grad_input=gradient)
             else:
                 torch.ops.aten.threshold_backward.grad_input(gradient, hidden, 0.0, grad_input=gradient)
-            below = self._hidden[layer - 1] if layer else inputs
-            torch.bmm(below.transpose(1, 2), gradient, out=self._scratch[layer])
+            turned = self._hidden_turned[layer - 1] if layer else inputs.transpose(1, 2)
+            torch.bmm(turned, gradient, out=self._scratch[layer])
             self._weight_gradients[layer].copy_(self._scratch[layer])
             torch.sum(gradient, dim=1, out=self._bias_gradients[layer])
             given = gradient
@@ -231,6 +238,13 @@ class Samples:
     log_probs: torch.Tensor
     advantages: torch.Tensor
     returns: torch.Tensor
+
+    def of(self, dtype: torch.dtype) -> Samples:
+        """The same to compute with in `dtype`; SB3 scales advantages in float32, so they stay."""
+        actions = self.actions.to(dtype) if self.actions.is_floating_point() else self.actions
+        return Samples(
+            self.observations.to(dtype), actions, self.log_probs.to(dtype), self.advantages, self.returns.to(dtype)
+        )
 
 
 @dataclass(frozen=True)
@@ -264,37 +278,56 @@ class PPOReport:
 
 
 class _Minibatches:
-    """`count` minibatches of `size` samples a member, gathered: everything in rows of a multiple of ROWS.
+    """`count` minibatches of `size` samples a member, drawn anew each epoch into the same memory.
 
-    inputs: (count, 2P, rows, inputs).  actions: (count, P, action dimensions, rows).  minus_log_probs, returns: (count,
-    P, rows).  pulls: minus the advantages, divided by the size.
+    Everything has `rows`, a multiple of ROWS, instead of `size`; those too many are samples that count nothing.
+    inputs: (count, 2P, rows, inputs).  actions: (count, P, action dimensions, rows).  offsets: (count, P, rows) minus
+    the log-probabilities.  returns: likewise.  pulls: minus the advantages, scaled if they are to be, by the size.
+    log_ratios, losses, errors: what the minibatches gave, of each sample.  entropies: (count, P) means.
     """
 
-    def __init__(self, samples: Samples, places: NDArray[np.int64], size: int, normalized: torch.Tensor, stack: Stack):
-        members, count = places.shape[0], places.shape[1] // size
+    def __init__(self, stack: Stack, samples: Samples, size: int, count: int, normalized: torch.Tensor) -> None:
         self.count, self.size, self.rows = count, size, rounded_up(size, ROWS)
-        index = np.zeros((count, members, self.rows), dtype=np.int64)
+        self._stack, self._samples, self._normalized = stack, samples, normalized
+        shape, device = stack.shape, stack.device
+        each = (count, stack.members, self.rows)
+
+        def empty(*sizes: int, dtype: torch.dtype = stack.dtype) -> torch.Tensor:
+            return torch.empty(sizes, dtype=dtype, device=device)
+
+        self.inputs = empty(count, 2 * stack.members, self.rows, shape.inputs)
+        wide, kind = (1, torch.int64) if shape.discrete else (shape.outputs, stack.dtype)
+        self.actions = empty(count, stack.members, wide, self.rows, dtype=kind)
+        self.offsets, self.returns, self.pulls = empty(*each), empty(*each), empty(*each)
+        self._observations, self._actions = empty(*each, shape.inputs), empty(*each, wide, dtype=kind)
+        self._advantages = empty(*each, dtype=torch.float32)
+        self.log_ratios, self.losses, self.errors = empty(*each), empty(*each), empty(*each)
+        self.entropies = empty(count, stack.members)
+
+    def draw(self, places: NDArray[np.int64]) -> None:
+        """Gather samples: (P, count * size) places in each member's."""
+        members, samples, size = self._stack.members, self._samples, self.size
+        index = np.zeros((self.count, members, self.rows), dtype=np.int64)
+        index[:, :, :size] = places.reshape(members, self.count, size).swapaxes(0, 1)
         index += np.arange(members)[:, None] * samples.returns.shape[1]
-        index[:, :, :size] += places.reshape(members, count, size).swapaxes(0, 1)
-        twice = np.repeat(index[:, :, None], 2, axis=2)
-        once, both = (torch.from_numpy(array.reshape(-1)).to(stack.device) for array in (index, twice))
-
-        def gathered(tensor: torch.Tensor, which: torch.Tensor = once) -> torch.Tensor:
-            return tensor.flatten(0, 1).index_select(0, which)
-
-        width = samples.observations.shape[2]
-        self.inputs = gathered(samples.observations, both).view(count, 2 * members, self.rows, width).to(stack.dtype)
-        actions = gathered(samples.actions).view(count, members, self.rows, -1).transpose(2, 3).contiguous()
-        self.actions = actions if stack.shape.discrete else actions.to(stack.dtype)
-        self.minus_log_probs = -gathered(samples.log_probs).view(count, members, self.rows).to(stack.dtype)
-        self.returns = gathered(samples.returns).view(count, members, self.rows).to(stack.dtype)
-        pulls = gathered(samples.advantages).view(count, members, self.rows)
+        which = torch.from_numpy(index.reshape(-1)).to(self._stack.device)
+        for source, target in (
+            (samples.observations, self._observations), (samples.actions, self._actions),
+            (samples.log_probs, self.offsets), (samples.returns, self.returns),
+            (samples.advantages, self._advantages),
+        ):  # fmt: skip
+            torch.index_select(source.flatten(0, 1), 0, which, out=target.flatten(0, 2))
+        split(self.inputs, 1, (members, 2)).copy_(self._observations[:, :, None])
+        self.actions.copy_(self._actions.transpose(2, 3))
+        self.offsets.neg_()
         if size > 1:  # as SB3, and as there in float32
-            mean, deviation = (of(pulls[:, :, :size], dim=2, keepdim=True) for of in (torch.mean, torch.std))
-            pulls -= mean * normalized
-            pulls /= torch.where(normalized > 0.0, deviation + 1e-8, 1.0)
-        self.pulls = pulls.to(stack.dtype)
-        self.pulls /= -size
+            mine = self._advantages[:, :, :size]
+            exact = mine.double()  # to float32's last digit what torch.std says, in a sixth of its time
+            exact -= exact.mean(2, keepdim=True)
+            deviation = exact.square_().sum(2, keepdim=True).div_(size - 1).sqrt_().float()
+            self._advantages.sub_(mine.mean(2, keepdim=True) * self._normalized)
+            self._advantages.div_(torch.where(self._normalized > 0.0, deviation + 1e-8, 1.0))
+        self.pulls.copy_(self._advantages).div_(-size)
         self.pulls[:, :, size:] = 0.0
 
 
@@ -304,19 +337,27 @@ class PPO:
     def __init__(
         self, stack: Stack, samples: Samples, settings: Sequence[PPOSettings], batch_size: int
     ) -> None:  # fmt: skip
-        self._stack, self._samples, self._settings = stack, samples, settings
-        self._batch_size = batch_size
+        self._stack = stack
+        count = samples.returns.shape[1]
+        whole, rest = divmod(count, batch_size)
 
-        def column(name: str) -> torch.Tensor:
-            values = [[getattr(one, name)] for one in settings]
-            return torch.tensor(values, dtype=stack.dtype, device=stack.device)
+        def column(numbers: Iterable[float], dtype: torch.dtype = stack.dtype) -> torch.Tensor:
+            return torch.tensor(list(numbers), dtype=torch.float64).to(stack.device, dtype)[:, None]
 
-        self._entropy, self._vf, self._max_norm = column("ent_coef"), column("vf_coef"), column("max_grad_norm")
-        self._clip, self._normalized = column("clip_range"), column("normalize_advantage").float()
-        ranges = torch.tensor([[one.clip_range] for one in settings], dtype=torch.float64)
-        self._low, self._high = (bound.to(stack.device, stack.dtype) for bound in (1.0 - ranges, 1.0 + ranges))
-        self._limits = torch.tensor([1.5 * one.target_kl for one in settings], device=stack.device, dtype=stack.dtype)
+        self._entropy = column(one.ent_coef for one in settings)
+        self._vf = column(one.vf_coef for one in settings)
+        self._max_norm = column(one.max_grad_norm for one in settings)
+        self._clip = column(one.clip_range for one in settings)
+        self._low = column(1.0 - one.clip_range for one in settings)
+        self._high = column(1.0 + one.clip_range for one in settings)
+        self._limits = column(1.5 * one.target_kl for one in settings)[:, 0]
         self._watched = any(math.isfinite(one.target_kl) for one in settings)
+        normalized = column((float(one.normalize_advantage) for one in settings), torch.float32)
+        self._parts = [
+            _Minibatches(stack, samples.of(stack.dtype), size, number, normalized)
+            for size, number in ((batch_size, whole), (rest, 1))
+            if size * number
+        ]
         self._adam = Adam(stack, [one.learning_rate for one in settings])
 
     def run(self, orders: Iterable[NDArray[np.int64]]) -> list[PPOReport]:
@@ -326,16 +367,16 @@ class PPO:
         made, epochs, last = [0] * members, [0] * members, [0] * members
         records: list[tuple[torch.Tensor, ...]] = []
         for order in orders:
-            if not any(self._active):
-                break
             for member in range(members):
                 if self._active[member]:
                     last[member], epochs[member] = made[member], epochs[member] + 1
-            whole = order.shape[1] // self._batch_size * self._batch_size
-            for part, size in ((order[:, :whole], self._batch_size), (order[:, whole:], order.shape[1] - whole)):
-                if part.size:
-                    batches = _Minibatches(self._samples, part, size, self._normalized, self._stack)
-                    records.append(self._learn(batches, made))
+            first = 0
+            for part in self._parts:
+                part.draw(order[:, first : first + part.size * part.count])
+                first += part.size * part.count
+                records.append(self._learn(part, made))
+            if not any(self._active):
+                break
         columns = [torch.cat(parts).cpu().numpy() for parts in zip(*records, strict=True)]
         reports = []
         for member in range(members):
@@ -351,35 +392,42 @@ class PPO:
         gradients = split(networks.output_gradients, 0, (members, 2))
         values, value_gradients = outputs[:, CRITIC, 0], gradients[:, CRITIC, 0]
         head = head_of(stack, outputs[:, ACTOR], gradients[:, ACTOR], size)
-        log_ratios, losses, errors = (torch.empty_like(batches.returns) for _ in range(3))
-        entropies = torch.empty(batches.count, members, device=stack.device, dtype=stack.dtype)
         low, high = (bound.expand(members, rows).contiguous() for bound in (self._low, self._high))
-        value_scale = (self._vf * 2.0 / size).expand(members, rows).contiguous()
+        value_scale = (self._vf * 2.0 / size).repeat(1, rows)
         value_scale[:, size:] = 0.0
-        for index in range(batches.count):
-            inputs, log_ratio = batches.inputs[index], log_ratios[index]
+        views = (
+            tensor.unbind(0)
+            for tensor in (
+                batches.inputs, batches.actions, batches.offsets, batches.pulls, batches.returns,
+                batches.log_ratios, batches.losses, batches.errors, batches.entropies,
+            )
+        )  # fmt: skip
+        for inputs, actions, offsets, pulls, returns, log_ratio, loss, error, entropy in zip(*views, strict=True):
             networks.forward(inputs)
-            head.log_prob(batches.actions[index], batches.minus_log_probs[index], log_ratio)
-            head.entropy(entropies[index])
+            head.log_prob(actions, offsets, log_ratio)
+            head.entropy(entropy)
             ratio = torch.exp(log_ratio)
-            pull = ratio * batches.pulls[index]
-            clipped = torch.clamp(ratio, low, high).mul_(batches.pulls[index])
-            torch.maximum(pull, clipped, out=losses[index])
+            clipped = torch.clamp(ratio, low, high).mul_(pulls)
+            pull = ratio.mul_(pulls)
+            torch.maximum(pull, clipped, out=loss)
             pull.mul_(pull >= clipped)
-            torch.sub(values, batches.returns[index], out=errors[index])
+            torch.sub(values, returns, out=error)
             for member, active in enumerate(self._active):
                 made[member] += active
             if self._watched and not self._keep_going(log_ratio[:, :size]):
                 break
-            torch.mul(errors[index], value_scale, out=value_gradients)
+            torch.mul(error, value_scale, out=value_gradients)
             head.backward(pull, self._entropy)
             networks.backward(inputs)
             self.gradient_step()
+        log_ratios = batches.log_ratios[:, :, :size]
         return (
-            losses[:, :, :size].sum(2), errors[:, :, :size].square().mean(2), -entropies,
-            _divergence(log_ratios[:, :, :size]),
-            ((log_ratios[:, :, :size].exp() - 1.0).abs() > self._clip).to(stack.dtype).mean(2),
-        )  # fmt: skip
+            batches.losses[:, :, :size].sum(2),
+            batches.errors[:, :, :size].square().mean(2),
+            -batches.entropies,
+            _divergence(log_ratios),
+            ((log_ratios.exp() - 1.0).abs() > self._clip).to(stack.dtype).mean(2),
+        )
 
     def gradient_step(self) -> None:
         """Clip each member's gradient, and let its Adam make a step."""
@@ -389,8 +437,10 @@ class PPO:
 
     def _keep_going(self, log_ratios: torch.Tensor) -> bool:
         """Stop members whose policy is farther from the one that acted than 1.5 `target_kl`."""
-        self._adam.active *= ~(_divergence(log_ratios) > self._limits)
-        self._active = [bool(active) for active in self._adam.active.tolist()]
+        stops = (_divergence(log_ratios) > self._limits).tolist()
+        if any(stops):
+            self._active = [active and not stop for active, stop in zip(self._active, stops, strict=True)]
+            self._adam.move(self._active)
         return any(self._active)
 
 
@@ -461,41 +511,48 @@ def head_of(stack: Stack, outputs: torch.Tensor, gradients: torch.Tensor, size: 
 
 
 class Adam:
-    """torch's Adam with a learning rate for each member; members may sit a step out."""
+    """torch's Adam with a learning rate for each member; members may sit steps out."""
 
     def __init__(self, stack: Stack, learning_rates: Sequence[float]) -> None:
         self._stack, self._rates = stack, learning_rates
-        self._rows: list[tuple[list[torch.Tensor], ...]] = [
-            ([stack.weights[p]], [stack.gradient[p]], [stack.exp_avg[p]], [stack.exp_avg_sq[p]], [], [stack.steps[p]])
-            for p in range(stack.members)
-        ]
         self._columns = torch.tensor(learning_rates, dtype=torch.float64, device=stack.device)
-        self.active = torch.ones(stack.members, device=stack.device)
+        self.move([True] * stack.members)
+
+    def move(self, active: Sequence[bool]) -> None:
+        """Let these members make the steps from now on; the others keep all they have."""
+        stack = self._stack
+        self._active = torch.tensor(active, dtype=torch.float32, device=stack.device)
+        self._groups: dict[float, tuple[list[torch.Tensor], ...]] = {}  # by learning rate: what the kernel takes
+        tensors = (stack.weights, stack.gradient, stack.exp_avg, stack.exp_avg_sq, stack.steps)
+        for member, rate in enumerate(self._rates):
+            if active[member]:
+                lists = self._groups.setdefault(rate, tuple([] for _ in tensors))
+                for rows, mine in zip(tensors, lists, strict=True):
+                    mine.append(rows[member])
 
     def step(self) -> None:
-        """One step of every member whose `active` is 1; the others keep all they have."""
-        self._stack.steps.add_(self.active)
+        """One step of every member that moves."""
+        self._stack.steps.add_(self._active)
         if self._stack.device.type == "cpu":
             self._row_by_row()
         else:
             self._together()
 
     def _row_by_row(self) -> None:
-        for row, rate, active in zip(self._rows, self._rates, self.active.tolist(), strict=True):
-            if active:
-                torch._fused_adam_(
-                    *row, lr=rate, beta1=BETAS[0], beta2=BETAS[1], weight_decay=0.0, eps=EPS,
-                    amsgrad=False, maximize=False,
-                )  # fmt: skip
+        for rate, (weights, gradients, averages, squares, steps) in self._groups.items():
+            torch._fused_adam_(
+                weights, gradients, averages, squares, [], steps, lr=rate, beta1=BETAS[0], beta2=BETAS[1],
+                weight_decay=0.0, eps=EPS, amsgrad=False, maximize=False,
+            )  # fmt: skip
 
     def _together(self) -> None:
         """Without a kernel for each member: for devices where starting one is what costs."""
-        stack, active = self._stack, self.active[:, None, None]
+        stack, active = self._stack, self._active[:, None, None]
         gradient = torch.where(active > 0.0, stack.gradient, 0.0)
         stack.exp_avg.lerp_(gradient, (1.0 - BETAS[0]) * active.to(stack.dtype))
         stack.exp_avg_sq.lerp_(gradient.square_(), (1.0 - BETAS[1]) * active.to(stack.dtype))
         first, second = (1.0 - beta ** stack.steps.double().clamp(min=1.0) for beta in BETAS)
-        rates, roots = (self._columns * self.active / first).to(stack.dtype), second.sqrt().to(stack.dtype)
+        rates, roots = (self._columns * self._active / first).to(stack.dtype), second.sqrt().to(stack.dtype)
         denominators = stack.exp_avg_sq.sqrt().div_(roots[:, None, None]).add_(EPS)
         stack.weights.sub_(stack.exp_avg.div(denominators).mul_(rates[:, None, None]))
 

@@ -41,6 +41,7 @@ from space_dist.standing import Cause, Standing, standings
 MAX_MAPS: Final = 24
 MAX_POOLED: Final = 200  # settings of which cells are pooled
 MAX_NAMED: Final = 12  # runs that a sentence names
+LEAST_POPULATIONS: Final = 5  # coupled ones, for an interval over a cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,6 +365,22 @@ def fingerprint_remarks(cells: Sequence[CellRuns], manifest: Manifest) -> list[s
         ]  # fmt: skip
     if moved := [(cell, run) for cell, run in runs if run.status.fingerprint_changed]:
         lines.append(f"Resumed with another CPU model or other library versions, and counted: {named(moved)}.")
+    return lines
+
+
+def coupled_remarks(cells: Sequence[CellRuns]) -> list[str]:
+    """Of cells whose runs train several policies under one curriculum: what a sample is, and whether there are few."""
+    lines = []
+    for cell in cells:
+        curriculum = cell.cell.config["curriculum"]
+        if curriculum.get("aggregate") == "population":
+            finished = len(cell.configuration.finished)
+            few = f" There are {finished}: an interval over fewer than {LEAST_POPULATIONS} says little."
+            lines.append(
+                f"{cell.label}: each run trains {curriculum['policies']} policies that share one curriculum, so they "
+                "depend on each other and count as one sample; returns are means over them, steps are those of all."
+                + (few if finished < LEAST_POPULATIONS else "")
+            )
     return lines
 
 

@@ -19,6 +19,7 @@ from space_dist.report.grid import (
     CellRuns,
     Comparison,
     compare,
+    coupled_remarks,
     failures,
     fingerprint_remarks,
     grouped,
@@ -188,7 +189,7 @@ def _summary(
 
 
 def _remarks(manifest: Manifest, cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[str]:
-    lines = fingerprint_remarks(cells, manifest)
+    lines = fingerprint_remarks(cells, manifest) + coupled_remarks(cells)
     if alone := [cell.label for cell, comparison in zip(cells, compared, strict=True) if comparison.reference is None]:
         shown = ", ".join(alone[:MAX_LISTED]) + (", ..." if len(alone) > MAX_LISTED else "")
         lines.append(f"Not compared, for their environment or test set has no counterpart of the baseline: {shown}.")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
-from tests.grids import ROOT
+from space_dist import config as configs
+from tests.grids import ROOT, write_line_instances
+from tests.slurm.gated_env import GATE
 
 sys.path.append(str(ROOT / "jobs"))
 
@@ -29,9 +32,21 @@ def test_the_plan_is_seeded_and_even() -> None:
 @pytest.mark.ray
 @pytest.mark.server
 @pytest.mark.timeout(600)
-def test_a_grid_under_faults_is_the_grid_left_alone() -> None:
-    said: list[str] = []
-    result = rehearse(runs=3, steps=51_200, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append)
+def test_a_grid_under_faults_is_the_grid_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs whose environment sleeps until the last fault has fallen: the machine is left to what recovers."""
+    base, gate, said = tmp_path / "run.yaml", tmp_path / "gate", list[str]()
+    base.write_text(configs.to_yaml({
+        "name": "base", "env": {"id": "tests.slurm.gated_env:make"}, "curriculum": {"kind": "space"},
+        "learner": {"kind": "ppo", "n_epochs": 1, "net_arch": [16]}, "rollout": {"shards": 2, "slots": 2},
+        "budget": {"steps": 1024}, "instances": {"train": "train.csv", "test": "test.csv"},
+    }))  # fmt: skip
+    instances = write_line_instances(tmp_path)
+    gate.touch()
+    monkeypatch.setenv(GATE, str(gate))
+    result = rehearse(
+        runs=3, steps=7680, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append, base=base, last=0.4,
+        settings={**instances, "learner.n_steps": 256, "evaluation.every_steps": 2560}, after_faults=gate.unlink,
+    )  # fmt: skip
     assert not result.faults, "\n".join([*result.faults, *said])
     assert sorted(hit.fault.kind for hit in result.hits) == sorted(BOUNDED)
     assert all(hit.seconds is not None for hit in result.hits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
 from tests.faults.test_requests import ROOT, command
 from tests.test_learners import results
@@ -33,11 +35,11 @@ def on_host(name: str, *flags: str) -> list[str]:
 @needs_namespaces
 @pytest.mark.parametrize("flags", [(), ("--pid", "--fork", "--kill-child")], ids=["hosts", "two containers"])
 def test_of_two_processes_on_two_hosts_one_works_and_the_other_says_why(tmp_path: Path, flags: tuple[str, ...]) -> None:
-    train = command(tmp_path, "env.kwargs={seconds: 0.02}", env="tests.faults.slow_env:make")
+    train = command(tmp_path, env="tests.faults.slow_env:make")
     both = [
         subprocess.Popen(
             [*on_host(f"node{number}", *flags), *train], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True,
+            text=True, env={**os.environ, PAUSE: "0.02"},
         )
         for number in (1, 2)
     ]  # fmt: skip

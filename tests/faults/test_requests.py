@@ -15,6 +15,7 @@ from space_dist import config as configs
 from space_dist.interrupts import STOP_SIGNALS, StopRequests
 from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
 from tests.test_learners import results
 
@@ -76,10 +77,9 @@ def command(tmp_path: Path, *settings: str, env: str | None = None) -> list[str]
 
 def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(tmp_path: Path) -> None:
     slow = command(
-        tmp_path, "env.kwargs={seconds: 0.3}", "resources.grace_seconds=0.3", "evaluation.every_steps=100000",
-        env="tests.faults.slow_env:make",
-    )  # fmt: skip
-    process = subprocess.Popen(slow, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        tmp_path, "resources.grace_seconds=0.3", "evaluation.every_steps=100000", env="tests.faults.slow_env:make"
+    )
+    process = subprocess.Popen(slow, cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, PAUSE: "0.3"})
     try:
         deadline = time.monotonic() + 100
         while not list((tmp_path / "run" / "checkpoints").glob("round-*2.npz")) and time.monotonic() < deadline:
@@ -93,7 +93,7 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
     assert "Traceback" not in said
     status = Ledger(tmp_path / "run").status()
     assert status.checkpoint == "round-000000002.npz"
-    config = configs.load(tmp_path / "config.yaml", ["env.kwargs={seconds: 0.3}", "evaluation.every_steps=100000"])
+    config = configs.load(tmp_path / "config.yaml", ["evaluation.every_steps=100000"])
     launch(config, tmp_path / "run", resume=True, stop=StopRequests())
     launch(config, tmp_path / "reference", resume=True, stop=StopRequests())
     assert results(tmp_path / "run") == results(tmp_path / "reference")

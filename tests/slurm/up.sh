@@ -81,8 +81,10 @@ AccountingStorageType=accounting_storage/none
 JobAcctGatherType=jobacct_gather/none
 JobCompType=jobcomp/none
 GresTypes=gpu
-NodeName=n[1-$NODES] NodeAddr=$NET.[11-$((10 + NODES))] Port=$((PORT + 1)) CPUs=$CPUS RealMemory=$MEM Gres=gpu:2 State=UNKNOWN
+NodeName=n[1-$NODES] NodeAddr=$NET.[11-$((10 + NODES))] Port=$((PORT + 1)) CPUs=$CPUS RealMemory=$MEM Gres=gpu:2 Feature=avx,sse State=UNKNOWN
+Licenses=matlab:2
 PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+PartitionName=late Nodes=ALL MaxTime=INFINITE State=UP
 CONF
 echo "NodeName=n[1-$NODES] Name=gpu File=/dev/tty[1-2]" >"$D/gres.conf" # any device files do
 # --force: the folder above may be closed to others
@@ -93,7 +95,7 @@ unshare --mount bash -c 'mount --bind "$0" /etc/hosts && slurmctld' "$D/hosts" #
 for i in $(seq "$NODES"); do start_node "$i"; done
 SECONDS=0
 while [ $SECONDS -lt 60 ]; do
-  [ "$(timeout 5 sinfo -h -N -r -t idle -o %N 2>/dev/null | wc -l)" = "$NODES" ] && exit 0
+  [ "$(timeout 5 sinfo -h -p debug -N -r -t idle -o %N 2>/dev/null | wc -l)" = "$NODES" ] && exit 0
   sleep 0.2
 done
 echo "up.sh: the nodes are not idle after 60 s; see $D/log" >&2
