@@ -20,7 +20,7 @@ from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
-from space_dist.training import Progress, learner_of, resolved
+from space_dist.training import Progress, resolved
 from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
 
 UPDATES = 20
@@ -306,8 +306,8 @@ def test_observations_that_are_not_flat_are_refused() -> None:
 
 def test_a_population_has_an_update_of_its_own() -> None:
     overrides = ["learner.update=lean", "resources.workers=0"]
-    with pytest.raises(ConfigError, match=r"learner\.update: lean is for runs that work alone"):
-        learner_of(configs.load(SPACE, [*overrides, "engine=population"]))
+    with pytest.raises(ConfigError, match=r"learner\.update: lean says nothing with engine: population"):
+        configs.load(SPACE, [*overrides, "engine=population"])
     assert resolved(configs.load(SPACE, [*overrides, "engine=auto"])).engine == "single"
     assert resolved(configs.load(SPACE, ["engine=auto"])).engine == "population"
 

@@ -137,10 +137,6 @@ def refuse(config: LearnerConfig, observation_space: spaces.Space[Any], action_s
     """Raise ConfigError where the population engine cannot learn."""
     if not isinstance(config, PPOConfig):
         raise ConfigError(f"engine: population learns with learner.kind: ppo, not {config.kind}")
-    if config.update != "stock":
-        raise ConfigError(
-            f"learner.update: {config.update} is for runs that work alone; engine: population has an update of its own"
-        )
     if config.policy != "MlpPolicy":
         raise ConfigError(f"engine: population learns with learner.policy: MlpPolicy, not {config.policy}")
     if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
