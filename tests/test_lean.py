@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from space_dist import config as configs
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
-from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
+from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
+from space_dist.training import Progress, resolved
 from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
 
 UPDATES = 20
@@ -229,6 +232,35 @@ def test_the_same_round_gives_the_same_bits_and_another_seed_others() -> None:
     assert first != second == third
 
 
+def test_a_run_that_is_stopped_and_resumed_is_the_same_byte_for_byte(tmp_path: Path) -> None:
+    for split, targets in (("train", (-0.75, 0.75)), ("test", (-0.7, 0.7))):
+        rows = "".join(f"{number},{target}\n" for number, target in enumerate(targets))
+        (tmp_path / f"{split}.csv").write_text(f"id,target\n{rows}")
+    run = configs.parse(
+        {
+            "name": "lean", "env": {"id": LINE}, "curriculum": {"kind": "space"},
+            "instances": {split: str(tmp_path / f"{split}.csv") for split in ("train", "test")},
+            "learner": {"kind": "ppo", "update": "lean", "n_steps": 128, "n_epochs": 2},
+            "rollout": {"shards": 2, "slots": 4}, "budget": {"steps": 8 * 128}, "evaluation": {"every_steps": 512},
+            "tracking": {"uri": None}, "resources": {"workers": 0},
+        },
+        "test",
+    )  # fmt: skip
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    launch(run, whole, resume=False, stop=StopRequests())
+
+    def stop_at_the_third(progress: Progress) -> None:
+        if progress.steps == 3 * 128:
+            Ledger(parts).stop_file.touch()
+
+    with pytest.raises(Interrupted):
+        launch(run, parts, resume=False, stop=StopRequests(), observe=stop_at_the_third)
+    assert 0 < Ledger(parts).status().steps < 8 * 128
+    launch(run, parts, resume=True, stop=StopRequests())
+    for name in ("metrics.jsonl", "curriculum.jsonl", "model.npz"):
+        assert (parts / name).read_bytes() == (whole / name).read_bytes(), name
+
+
 @pytest.mark.parametrize("reward", [np.nan, np.inf])
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
 def test_rewards_that_are_no_numbers_end_as_divergence(env_id: str, reward: float) -> None:
@@ -270,6 +302,14 @@ def test_observations_that_are_not_flat_are_refused() -> None:
     images = spaces.Box(0, 255, shape=(3, 36, 36), dtype=np.uint8)
     with pytest.raises(ConfigError, match="MlpPolicy needs flat observations"):
         make_learner(small(update="lean"), images, BOX, seed=0, n_slots=1, slot_length=4, total_steps=4)
+
+
+def test_a_population_has_an_update_of_its_own() -> None:
+    overrides = ["learner.update=lean", "resources.workers=0"]
+    with pytest.raises(ConfigError, match=r"learner\.update: lean says nothing with engine: population"):
+        configs.load(SPACE, [*overrides, "engine=population"])
+    assert resolved(configs.load(SPACE, [*overrides, "engine=auto"])).engine == "single"
+    assert resolved(configs.load(SPACE, ["engine=auto"])).engine == "population"
 
 
 def test_the_update_is_part_of_what_a_run_is_and_stock_changes_no_identity() -> None:

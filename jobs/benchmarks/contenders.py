@@ -84,7 +84,7 @@ class Contender:
     """Who learns, and how it is set up.
 
     kind: ours, sb3 or rllib.  threads: of torch in the learning process.
-    update, workers, overrides: of ours.  vec_env, n_envs: SB3's dummy or subproc, or batched, ours in its interface.
+    update, workers, overlap: of ours.  vec_env, n_envs: SB3's dummy or subproc, or batched, ours in its interface.
     runners, n_envs: RLlib's processes and the environments of each.
     """
 
@@ -92,7 +92,7 @@ class Contender:
     threads: int = 1
     update: str = "stock"
     workers: int = 0
-    overrides: tuple[str, ...] = ()
+    overlap: bool = False
     vec_env: str = "subproc"
     n_envs: int = 2
     runners: int = 0
@@ -101,7 +101,7 @@ class Contender:
     def title(self) -> str:
         """In tables."""
         if self.kind == "ours":
-            return f"ours, {self.update}"
+            return f"ours, {self.update}" + (", collecting while updating" if self.overlap else "")
         if self.kind == "rllib":
             return "RLlib"
         names = {"subproc": "SubprocVecEnv", "dummy": "DummyVecEnv", "batched": "our batched environment"}
@@ -154,8 +154,9 @@ def measure(task: Task, contender: Contender, seconds: float) -> float:
 
 def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     config = task.run_config(
-        f"learner.update={contender.update}", f"resources.workers={contender.workers}", *contender.overrides
-    )
+        f"learner.update={contender.update}", f"resources.workers={contender.workers}",
+        f"rollout.overlap={str(contender.overlap).lower()}",
+    )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         run, seen = Path(folder) / "run", [-1]
 
@@ -334,9 +335,7 @@ def _main() -> None:
     if given["contender"] is None:
         found = limits(task)
     else:
-        settings = given["contender"]
-        contender = Contender(**settings | {"overrides": tuple(settings["overrides"])})
-        found = {"rate": measure(task, contender, given["seconds"])}
+        found = {"rate": measure(task, Contender(**given["contender"]), given["seconds"])}
     print(json.dumps(found))
 
 

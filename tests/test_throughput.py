@@ -1,0 +1,80 @@
+"""The parts of `jobs/benchmark.py throughput` whose faults would show in no number."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from space_dist.envs import make_batched
+from tests.grids import ROOT
+
+sys.path.append(str(ROOT / "jobs"))
+
+from benchmarks.batched_vec_env import BatchedVecEnv
+from benchmarks.contenders import TASKS, Contender, specification
+from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio
+
+LINE = "tests.tiny_env:make"
+
+
+def row(*rates: float, **waits: float) -> Row:
+    return Row("somebody", "somehow", lambda: 0.0, waits, list(rates))
+
+
+def test_our_batched_environments_step_in_stable_baselines3s_interface_as_by_themselves() -> None:
+    contexts = np.array([[-0.5], [0.25]])
+    ours = BatchedVecEnv(make_batched(LINE, 3, context_visible=True), contexts, seed=4)
+    plain, random = make_batched(LINE, 3, context_visible=True), np.random.default_rng(4)
+
+    def start(slots: Any) -> Any:
+        drawn = contexts[random.integers(2, size=len(slots))]
+        return plain.reset(slots, drawn, random.integers(1 << 62, size=len(slots), dtype=np.uint64))
+
+    np.testing.assert_array_equal(ours.reset(), start(np.arange(3)))
+    ends, actions = 0, np.random.default_rng(0)
+    for _ in range(3 * plain.horizon):
+        action = actions.uniform(-1.0, 1.0, size=(3, *plain.action_space.shape)).astype(np.float32)
+        observations, rewards, dones, infos = ours.step(action)
+        step = plain.step(action)
+        np.testing.assert_array_equal(dones, step.terminated | step.truncated)
+        np.testing.assert_allclose(rewards, step.rewards, rtol=1e-6)
+        expected = step.observations.copy()
+        slots = np.flatnonzero(dones)
+        for slot in slots:
+            np.testing.assert_array_equal(infos[slot]["terminal_observation"], step.observations[slot])
+            assert infos[slot]["TimeLimit.truncated"] == (step.truncated[slot] and not step.terminated[slot])
+        assert all("terminal_observation" not in info for info, done in zip(infos, dones, strict=True) if not done)
+        if len(slots):
+            expected[slots] = start(slots)
+        np.testing.assert_array_equal(observations, expected)
+        ends += len(slots)
+    assert ends >= 9
+
+
+def test_ratios_are_medians_of_the_rounds_own() -> None:
+    # A machine that slows down to a tenth after the first round slows both.
+    assert _ratio(row(400.0, 40.0, 30.0), row(100.0, 10.0, 10.0)) == pytest.approx(4.0)
+
+
+def test_the_table_says_who_is_missing_and_where_time_goes() -> None:
+    rows = {"subproc2": row(100.0), "lean": row(400.0, simulator=1e-3, arithmetic=5e-4)}
+    text = _markdown({"cartpole": rows}, {"lean_vs_rllib": 4.0}, {}, 1)
+    assert "| somebody | somehow | 400 (400-400) | 4.0 | simulator 40%, dispatch 40%, arithmetic 20% |" in text
+    assert "| RLlib | not installed (extra `bench`) | | | |" in text
+    assert "| `lean_vs_rllib` | 4.00 | 3 |" in text
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_tasks_differ_in_nothing_but_what_they_say(name: str) -> None:
+    task = TASKS[name]
+    learner = task.run_config("learner.update=lean").learner
+    assert (learner.kind, learner.n_steps, learner.net_arch) == ("ppo", task.n_steps, (64, 64))
+    assert (learner.batch_size, learner.n_epochs) == (task.batch_size, 10)
+    assert name in specification(name, Contender("ours"), 1.0)
+
+
+def test_every_ratio_has_a_goal() -> None:
+    assert PAIRS.keys() == WANTED.keys()
