@@ -13,6 +13,19 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that start Slurm, Ray or servers come first: they take longest, and must not be begun last.
+
+    pytest-xdist deals out whole files in this order, with `--no-loadscope-reorder`.
+    """
+    ranks: dict[Path, int] = {}
+    for item in items:
+        marks = {mark.name for mark in item.iter_markers()}
+        rank = 0 if "slurm" in marks else 1 if marks & {"ray", "server"} else 2
+        ranks[item.path] = min(rank, ranks.get(item.path, rank))
+    items.sort(key=lambda item: ranks[item.path])
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _sb3_logs_in_pytests_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Stable-Baselines3's own `learn`, which some tests compare with, logs into the system's temporary folder."""

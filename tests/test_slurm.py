@@ -218,7 +218,7 @@ def test_templates_can_be_replaced_and_their_faults_are_named(manifest: Manifest
     (tmp_path / "finish.sh.j2").write_text('echo {{ temp ~ "\'" }}\nexit 0\n')
     text = render(made, tmp_path)[TRAIN]
     assert text.endswith("""echo '/tmp'"'"''\nexit 0\n""")  # quoted without being asked to
-    assert "scontrol requeue" not in text
+    assert 'exit "$code"' not in text
     (tmp_path / "finish.sh.j2").write_text("\n{% if %}")
     with pytest.raises(ConfigError, match=r"finish\.sh\.j2, line 2"):
         render(made, tmp_path)

@@ -246,6 +246,8 @@ def _values(grid: Export) -> dict[str, Any]:
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
         "sync": manifest.tracking.uri is not None,
+        "where": "." if grid.root is None else str(grid.root / manifest.name),
+        "results": "" if grid.root is None else f"{grid.root / manifest.name}/",
         "env": {_Safe(name): value for name, value in profile.env.items()},
         "modules": profile.modules, "venv": profile.venv, "conda": profile.conda,
         "apptainer": profile.apptainer, "apptainer_options": profile.apptainer_options,
