@@ -30,8 +30,8 @@ CUDA = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available
 Gradients = list[dict[str, NDArray[Any]]]
 
 # What may differ between the members of one stack. Of PPO's, the third and the last stop some updates early; of TRPO's,
-# the second finds no step in some, and three leave the conjugate gradients early. (Many steps of those with little
-# damping say nothing here: they amplify the last digit, whoever makes them.)
+# the second finds no step in some. (Many conjugate gradients with little damping amplify the last digit, whoever
+# computes them, so there are fewer here than by default.)
 OWN: dict[str, tuple[dict[str, Any], ...]] = {
     "ppo": (
         {},
@@ -42,7 +42,7 @@ OWN: dict[str, tuple[dict[str, Any], ...]] = {
         {"learning_rate": 1e-2, "target_kl": 0.005, "clip_range": 0.4, "max_grad_norm": 5.0},
     ),
     "trpo": (
-        {},
+        {"cg_max_steps": 8},
         {"learning_rate_schedule": "linear", "target_kl": 1.0, "line_search_max_iter": 1, "cg_damping": 1.0,
          "gamma": 0.8},
         {"cg_damping": 10.0, "gae_lambda": 0.7, "learning_rate": 3e-3},
@@ -148,8 +148,8 @@ def watch_population(members: int, patched: pytest.MonkeyPatch) -> list[Gradient
     [
         ("ppo", LINE, "tanh", (16, 8), "rows"),
         ("ppo", DISCRETE_LINE, "relu", (8,), "together"),
-        ("trpo", LINE, "relu", (8, 16, 16), "together"),
-        ("trpo", DISCRETE_LINE, "tanh", (16,), "rows"),
+        ("trpo", LINE, "tanh", (8, 16, 16), "together"),
+        ("trpo", DISCRETE_LINE, "relu", (16, 8), "rows"),
     ],
 )
 def test_every_member_learns_what_stable_baselines3_does(
@@ -197,7 +197,7 @@ def test_every_member_learns_what_stable_baselines3_does(
     if kind == "ppo":
         assert min(least_steps) < 6 == max(least_steps)  # target_kl has stopped some, and left others alone
     else:
-        assert set(found) == {0.0, 1.0}
+        assert set(found) == ({0.0, 1.0} if env_id == LINE else {1.0})
     for reference, mine in zip(references, members, strict=True):
         (theirs_saved, theirs_data), (saved, data) = reference.save(), mine.save()
         assert data == theirs_data
