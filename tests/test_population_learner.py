@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,21 +19,37 @@ from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner import OnPolicyLearner, Update
 from space_dist.learner.population import PopulationLearner, learn_together, refuse, stack_key
-from space_dist.learner.stacked import PPO, Adam
+from space_dist.learner.stacked import PPO, Adam, Stack
+from space_dist.learner.trust_region import TRPO
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
 from tests.test_learner import BOX, DISCRETE_LINE, LENGTH, LINE, SLOTS, learner_for, shards_of, small
 
 STEPS = 2 * SLOTS * LENGTH
 CUDA = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device"))
-# What may differ between the members of one stack. The third and the last stop some updates early.
-OWN: tuple[dict[str, Any], ...] = (
-    {},
-    {"learning_rate": 1e-3, "learning_rate_schedule": "linear", "clip_range": 0.05, "gamma": 0.8, "gae_lambda": 0.7},
-    {"learning_rate": 3e-3, "ent_coef": 0.01, "vf_coef": 1.0, "target_kl": 0.002, "max_grad_norm": None},
-    {"normalize_advantage": False, "max_grad_norm": 0.05, "ent_coef": 0.03, "vf_coef": 0.1},
-    {"learning_rate": 1e-2, "target_kl": 0.01, "clip_range": 0.4, "max_grad_norm": 5.0},
-)
+Gradients = list[dict[str, NDArray[Any]]]
+
+# What may differ between the members of one stack. Of PPO's, the third and the last stop some updates early; of TRPO's,
+# the second finds no step in some. (Many conjugate gradients with little damping amplify the last digit, whoever
+# computes them, so there are fewer here than by default.)
+OWN: dict[str, tuple[dict[str, Any], ...]] = {
+    "ppo": (
+        {},
+        {"learning_rate": 1e-3, "learning_rate_schedule": "linear", "clip_range": 0.05, "gamma": 0.8,
+         "gae_lambda": 0.7},
+        {"learning_rate": 3e-3, "ent_coef": 0.01, "vf_coef": 1.0, "target_kl": 5e-4, "max_grad_norm": None},
+        {"normalize_advantage": False, "max_grad_norm": 0.05, "ent_coef": 0.03, "vf_coef": 0.1},
+        {"learning_rate": 1e-2, "target_kl": 0.005, "clip_range": 0.4, "max_grad_norm": 5.0},
+    ),
+    "trpo": (
+        {"cg_max_steps": 8},
+        {"learning_rate_schedule": "linear", "target_kl": 1.0, "line_search_max_iter": 1, "cg_damping": 1.0,
+         "gamma": 0.8},
+        {"cg_damping": 10.0, "gae_lambda": 0.7, "learning_rate": 3e-3},
+        {"cg_max_steps": 3, "line_search_shrinking_factor": 0.5, "normalize_advantage": False},
+        {"cg_damping": 0.05, "cg_max_steps": 6, "target_kl": 0.03, "line_search_max_iter": 3},
+    ),
+}  # fmt: skip
 
 
 def member(config: LearnerConfig, env_id: str = LINE, *, seed: int = 0, updates: int = 4, **more: Any) -> Any:
@@ -60,108 +78,126 @@ def weights(learner: Any) -> dict[str, NDArray[Any]]:
 
 
 def collected(member: Any, env_id: str, round: int) -> list[Shard]:
-    """What a member's weights collect, in float32 as ever."""
-    actor = learner_for(member.settings, env_id)
-    arrays, data = member.save()
-    actor.load({name: array.astype(np.float32) if array.dtype == np.float64 else array
-                for name, array in arrays.items()}, data)  # fmt: skip
-    return shards_of(actor, env_id, round=round)
+    """What a member collects with its weights in float32."""
+    policy = member.policy(round)
+    parts = (policy.actor, *policy.critics)
+    actor, critic = (tuple(tuple(array.astype(np.float32) for array in layer) for layer in part) for part in parts)
+    head = policy.head
+    if head.log_std is not None:
+        head = dataclasses.replace(head, log_std=head.log_std.astype(np.float32))
+    narrow = dataclasses.replace(policy, actor=actor, critics=(critic,), head=head)
+    return shards_of(SimpleNamespace(policy=lambda _: narrow), env_id, round=round)  # type: ignore[arg-type]
 
 
-class Watched:
-    """Gradients before and after clipping, by parameter, of every optimiser step."""
+def watch_stable_baselines3(learner: Any, patched: pytest.MonkeyPatch) -> Gradients:
+    """The gradients of every optimiser step, by parameter; PPO's also before they were clipped, with their norm."""
+    steps: Gradients = []
+    clip, step, policy = torch.nn.utils.clip_grad_norm_, learner.model.policy.optimizer.step, learner.model.policy
 
-    def __init__(self) -> None:
-        self.steps: list[list[dict[str, NDArray[Any]]]] = []
+    def gradients(prefix: str) -> dict[str, NDArray[Any]]:
+        named = policy.named_parameters()
+        return {prefix + name: one.grad.numpy().copy() for name, one in named if one.grad is not None}
 
-    def theirs(self, monkeypatch: pytest.MonkeyPatch, learner: Any) -> None:
-        """Watch Stable-Baselines3."""
-        self.steps = []
-        clip = torch.nn.utils.clip_grad_norm_
+    def clipping(*arguments: Any) -> Any:
+        steps.append(gradients("before "))
+        steps[-1]["norm"] = clip(*arguments).numpy().copy()
 
-        def gradients() -> dict[str, NDArray[Any]]:
-            named = learner.model.policy.named_parameters()
-            return {name: parameter.grad.numpy().copy() for name, parameter in named}
+    def stepping(*arguments: Any) -> Any:
+        if learner._settings.kind == "trpo":
+            steps.append({})
+        steps[-1] |= gradients("")
+        return step(*arguments)
 
-        def watch(*arguments: Any) -> Any:
-            before = gradients()
-            norm = clip(*arguments)
-            self.steps.append([before, gradients(), {"norm": norm.numpy().copy()}])
-            return norm
+    patched.setattr(torch.nn.utils, "clip_grad_norm_", clipping)
+    patched.setattr(policy.optimizer, "step", stepping)
+    return steps
 
-        monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", watch)
 
-    def ours(self, monkeypatch: pytest.MonkeyPatch) -> list[list[list[dict[str, NDArray[Any]]]]]:
-        """Watch a population: steps by member."""
-        steps: list[list[list[dict[str, NDArray[Any]]]]] = [[] for _ in OWN]
-        step = PPO.gradient_step
+def watch_population(members: int, patched: pytest.MonkeyPatch) -> list[Gradients]:
+    """The same of each member of a population."""
+    steps: list[Gradients] = [[] for _ in range(members)]
+    ppo, trpo = PPO.gradient_step, TRPO.critic_step
 
-        def watch(self: PPO) -> None:
-            stack = self._stack
-            before = stack.gradient.clone()
-            active = list(self._active)
-            step(self)
-            for index, mine in enumerate(steps):
-                if active[index]:
-                    one = [
-                        {name: stack.parameter(rows, name)[index].cpu().numpy().copy() for name in stack.layout.names}
-                        for rows in (before, stack.gradient)
-                    ]
-                    norm = np.sqrt(sum((array.astype(np.float64) ** 2).sum() for array in one[0].values()))
-                    mine.append([*one, {"norm": norm}])
+    def gradients(stack: Stack, member: int, prefix: str) -> dict[str, NDArray[Any]]:
+        named = {name: stack.parameter(stack.gradient, name) for name in stack.layout.names}
+        return {prefix + name: one[member].cpu().numpy().copy() for name, one in named.items()}
 
-        monkeypatch.setattr(PPO, "gradient_step", watch)
-        return steps
+    def watch_ppo(self: PPO) -> None:
+        stack, active = self._stack, list(self._active)
+        before = [gradients(stack, member, "before ") for member in range(members)]
+        ppo(self)
+        for member, mine in enumerate(before):
+            if active[member]:
+                norm = np.sqrt(sum((array**2).sum() for array in mine.values()))
+                steps[member].append({**mine, **gradients(stack, member, ""), "norm": norm})
+
+    def watch_trpo(self: TRPO) -> None:
+        trpo(self)
+        for member in range(members):
+            mine = gradients(self._stack, member, "")
+            steps[member].append({name: array for name, array in mine.items() if "value" in name})
+
+    patched.setattr(PPO, "gradient_step", watch_ppo)
+    patched.setattr(TRPO, "critic_step", watch_trpo)
+    return steps
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 @pytest.mark.parametrize(
-    ("env_id", "activation", "net_arch", "kernel"),
-    [(LINE, "tanh", (16, 8), "rows"), (DISCRETE_LINE, "relu", (8,), "together")],
+    ("kind", "env_id", "activation", "net_arch", "kernel"),
+    [
+        ("ppo", LINE, "tanh", (16, 8), "rows"),
+        ("ppo", DISCRETE_LINE, "relu", (8,), "together"),
+        ("trpo", LINE, "tanh", (8, 16, 16), "together"),
+        ("trpo", DISCRETE_LINE, "relu", (16, 8), "rows"),
+    ],
 )
 def test_every_member_learns_what_stable_baselines3_does(
-    env_id: str, activation: str, net_arch: tuple[int, ...], kernel: str, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    kind: str, env_id: str, activation: str, net_arch: tuple[int, ...], kernel: str, device: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     """Twenty updates in float64, from the same rollouts. A batch size that leaves a smaller last minibatch."""
     updates = 20
     if kernel == "together":
         monkeypatch.setattr(Adam, "_row_by_row", Adam._together)  # what devices other than the CPU use
-    configs = [small(activation=activation, net_arch=net_arch, batch_size=40, **own) for own in OWN]
+    passes = {"n_epochs": 2} if kind == "ppo" else {"n_critic_updates": 2}
+    shared = {"activation": activation, "net_arch": net_arch, "batch_size": 40, **passes}
+    configs = [small(kind, **(shared | own)) for own in OWN[kind]]
     more = {"dtype": torch.float64, "device": device, "updates": updates}
     members = [member(config, env_id, seed=seed, **more) for seed, config in enumerate(configs)]
     references = [
         doubled(learner_for(config, env_id, seed=seed, updates=updates), env_id) for seed, config in enumerate(configs)
     ]
-    stopped = 0
+    least_steps, found = [], []
     for number in range(updates):
         rounds = [collected(one, env_id, number) for one in members]
-        steps = (number + 1) * STEPS
+        reached = (number + 1) * STEPS
         with monkeypatch.context() as patched:
-            watched = Watched().ours(patched)
-            results = learn_together(members, rounds, round=[number] * len(OWN), steps=[steps] * len(OWN))
-        for index, (reference, mine) in enumerate(zip(references, members, strict=True)):
-            theirs = Watched()
+            watched = watch_population(len(members), patched)
+            results = learn_together(
+                members, rounds, round=[number] * len(members), steps=[reached] * len(members)
+            )  # fmt: skip
+        for index, (reference, mine, result) in enumerate(zip(references, members, results, strict=True)):
+            place = f"member {index}, update {number}"
             with monkeypatch.context() as patched:
-                theirs.theirs(patched, reference)
-                expected = reference.update(rounds[index], round=number, steps=steps)
-            result = results[index]
-            assert isinstance(result, Update)
-            assert result.gradient_steps == expected.gradient_steps == len(theirs.steps) == len(watched[index])
-            stopped += expected.gradient_steps < 9
-            assert set(result.metrics) == set(expected.metrics)
-            for name, value in expected.metrics.items():
-                assert result.metrics[name] == pytest.approx(value, rel=1e-5, abs=1e-5), (name, index, number)
-            np.testing.assert_allclose(result.advantages, expected.advantages, rtol=1e-5, atol=1e-5)
-            for step, (ours, wanted) in enumerate(zip(watched[index], theirs.steps, strict=True)):
-                for part, part_wanted in zip(ours, wanted, strict=True):
-                    assert set(part) == set(part_wanted)
-                    for name, array in part_wanted.items():
-                        np.testing.assert_allclose(
-                            part[name], array, rtol=1e-5, atol=1e-5, err_msg=f"{name} {index} {number} {step}"
-                        )
-            for name, array in weights(reference).items():
-                np.testing.assert_allclose(weights(mine)[name], array, rtol=1e-5, atol=1e-5, err_msg=f"{name} {index}")
-    assert stopped > 5
+                steps = watch_stable_baselines3(reference, patched)
+                expected = reference.update(rounds[index], round=number, steps=reached)
+            assert isinstance(result, Update), place
+            assert result.gradient_steps == expected.gradient_steps == len(steps) == len(watched[index]), place
+            assert result.metrics == {
+                name: pytest.approx(value, rel=1e-5, abs=1e-5) for name, value in expected.metrics.items()
+            }, place
+            np.testing.assert_allclose(result.advantages, expected.advantages, rtol=1e-5, atol=1e-5, err_msg=place)
+            for ours, theirs in zip([*watched[index], weights(mine)], [*steps, weights(reference)], strict=True):
+                assert ours.keys() == theirs.keys()
+                for name, array in theirs.items():
+                    np.testing.assert_allclose(ours[name], array, rtol=1e-5, atol=1e-5, err_msg=f"{name}, {place}")
+            least_steps.append(expected.gradient_steps)
+            found.append(expected.metrics.get("is_line_search_success"))
+    if kind == "ppo":
+        assert min(least_steps) < 6 == max(least_steps)  # target_kl has stopped some, and left others alone
+    else:
+        assert set(found) == ({0.0, 1.0} if env_id == LINE else {1.0})
     for reference, mine in zip(references, members, strict=True):
         (theirs_saved, theirs_data), (saved, data) = reference.save(), mine.save()
         assert data == theirs_data
@@ -180,20 +216,29 @@ def bits(learner: Any) -> dict[str, bytes]:
     return {name: array.tobytes() for name, array in arrays.items()} | {"data": repr(data).encode()}
 
 
-def company(env_id: str, net_arch: tuple[int, ...], batch_size: int) -> Iterator[tuple[Any, list[list[Shard]]]]:
+def company(
+    kind: str, env_id: str, net_arch: tuple[int, ...], batch_size: int
+) -> Iterator[tuple[Any, list[list[Shard]]]]:
     """Twenty members of one shape with what each learns from in two updates; one of them will diverge."""
     for index in range(20):
-        own = {"learning_rate": 1e30} if index == 7 else OWN[index % len(OWN)]
-        config = small(net_arch=net_arch, batch_size=batch_size, **own)
+        own = {"learning_rate": 1e30} if index == 7 else OWN[kind][index % 5]
+        config = small(kind, **({"net_arch": net_arch, "batch_size": batch_size} | own))
         learner = member(config, env_id, seed=index)
         yield learner, [shards_of(learner, env_id, round=number) for number in range(2)]
 
 
 @pytest.mark.parametrize(
-    ("env_id", "net_arch", "batch_size"), [(LINE, (8,), 32), (LINE, (13, 7), 23), (DISCRETE_LINE, (5, 16), 32)]
+    ("kind", "env_id", "net_arch", "batch_size"),
+    [
+        ("ppo", LINE, (8,), 32),
+        ("ppo", LINE, (13, 7), 23),
+        ("ppo", DISCRETE_LINE, (5, 16), 32),
+        ("trpo", LINE, (13, 7), 23),
+        ("trpo", DISCRETE_LINE, (5, 16), 32),
+    ],
 )
-def test_companions_decide_nothing(env_id: str, net_arch: tuple[int, ...], batch_size: int) -> None:
-    everybody = list(company(env_id, net_arch, batch_size))
+def test_companions_decide_nothing(kind: str, env_id: str, net_arch: tuple[int, ...], batch_size: int) -> None:
+    everybody = list(company(kind, env_id, net_arch, batch_size))
     start = [learner.save() for learner, _ in everybody]
     alone: dict[int, Any] = {}
 
@@ -209,13 +254,17 @@ def test_companions_decide_nothing(env_id: str, net_arch: tuple[int, ...], batch
             results = learn_together(learners, rounds, round=numbers, steps=[(n + 1) * STEPS for n in numbers])
             for index, result in zip(together, results, strict=True):
                 assert isinstance(result, SpaceDistError) == (index == 7)
-                found[index].append(str(result) if isinstance(result, SpaceDistError) else result.metrics)
-        return {index: (found[index], bits(everybody[index][0])) for index in together}
+                found[index].append(result)
+        told = {
+            index: [str(one) if isinstance(one, SpaceDistError) else one.metrics for one in found[index]]
+            for index in together
+        }
+        return {index: (told[index], bits(everybody[index][0]), found[index]) for index in together}
 
     for index in range(5):
         alone |= learnt([index])
-    gradient_steps = {index: alone[index][1]["optimizer/policy/0/step"] for index in range(5)}
-    assert len(set(gradient_steps.values())) > 1  # some have stopped early
+    counts = {sum(update.gradient_steps for update in alone[index][2]) for index in range(5)}
+    assert (len(counts) > 1) == (kind == "ppo")  # of whom some have stopped early
     for together in (
         [0, 1],
         [4, 0],
@@ -228,18 +277,25 @@ def test_companions_decide_nothing(env_id: str, net_arch: tuple[int, ...], batch
     ):
         for index, result in learnt(together).items():
             if index in alone:
-                assert result == alone[index], (index, together)
+                assert result[:2] == alone[index][:2], (index, together)
 
 
 # ---- a member by itself ----
 
 
 @pytest.mark.parametrize(
-    ("env_id", "net_arch", "scaled"),
-    [(LINE, (8,), False), (LINE, (), True), (DISCRETE_LINE, (), False), (DISCRETE_LINE, (7, 9, 8), True)],
+    ("kind", "env_id", "net_arch", "scaled"),
+    [
+        ("ppo", LINE, (8,), False),
+        ("ppo", LINE, (), True),
+        ("ppo", DISCRETE_LINE, (), False),
+        ("ppo", DISCRETE_LINE, (7, 9, 8), True),
+        ("trpo", LINE, (), False),
+        ("trpo", DISCRETE_LINE, (7,), True),
+    ],
 )
-def test_checkpoints_do_not_tell_the_engine(env_id: str, net_arch: tuple[int, ...], scaled: bool) -> None:
-    config = small(net_arch=net_arch, normalize_observations=scaled, normalize_rewards=scaled)
+def test_checkpoints_do_not_tell_the_engine(kind: str, env_id: str, net_arch: tuple[int, ...], scaled: bool) -> None:
+    config = small(kind, net_arch=net_arch, normalize_observations=scaled, normalize_rewards=scaled)
     ours, stock = member(config, env_id), learner_for(config, env_id)
     assert bits(ours) == bits(stock)
     for number in range(2):
@@ -263,8 +319,9 @@ def test_checkpoints_do_not_tell_the_engine(env_id: str, net_arch: tuple[int, ..
 
 
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE])
-def test_a_checkpoint_restores_a_member_bit_for_bit(env_id: str) -> None:
-    config = small(learning_rate_schedule="linear", normalize_observations=True)
+@pytest.mark.parametrize("kind", ["ppo", "trpo"])
+def test_a_checkpoint_restores_a_member_bit_for_bit(kind: str, env_id: str) -> None:
+    config = small(kind, learning_rate_schedule="linear", normalize_observations=True)
     learner = member(config, env_id)
     rounds = [shards_of(learner, env_id, round=number) for number in range(4)]
 
@@ -283,18 +340,20 @@ def test_a_checkpoint_restores_a_member_bit_for_bit(env_id: str) -> None:
     assert bits(fresh) == bits(learner)
 
 
-def test_global_generators_are_left_alone() -> None:
-    learner = member(small())
+@pytest.mark.parametrize("kind", ["ppo", "trpo"])
+def test_global_generators_are_left_alone(kind: str) -> None:
+    learner = member(small(kind))
     shards = shards_of(learner)
     before = np.random.get_state()[1].tobytes(), torch.get_rng_state().numpy().tobytes()  # noqa: NPY002
     learner.update(shards, round=0, steps=STEPS)
     assert (np.random.get_state()[1].tobytes(), torch.get_rng_state().numpy().tobytes()) == before  # noqa: NPY002
 
 
-def test_divergence_is_told_as_stable_baselines3s_is() -> None:
-    config = small(learning_rate=1e30)
+@pytest.mark.parametrize("kind", ["ppo", "trpo"])
+def test_divergence_is_told_as_stable_baselines3s_is(kind: str) -> None:
+    config = small(kind)
     ours, stock = member(config), learner_for(config)
-    shards = shards_of(ours)
+    shards = [dataclasses.replace(shard, rewards=shard.rewards * np.inf) for shard in shards_of(ours)]
     messages = []
     for learner in (ours, stock):
         with pytest.raises(SpaceDistError, match="training diverged in update 3: the networks are no longer") as caught:
@@ -308,6 +367,7 @@ def test_who_can_learn_together() -> None:
     key = stack_key(config, BOX, BOX)
     same = {"learning_rate": 1.0, "clip_range": 0.3, "gamma": 0.1, "target_kl": 1.0, "normalize_rewards": True}
     assert stack_key(small(**same), BOX, BOX) == key
+    assert stack_key(small("trpo"), BOX, BOX) != key
     for changes in ({"n_steps": 48}, {"batch_size": 16}, {"n_epochs": 2}, {"net_arch": (9,)}, {"activation": "relu"}):
         assert stack_key(small(**changes), BOX, BOX) != key
     assert stack_key(config, BOX, spaces.Discrete(2)) != key
@@ -322,7 +382,7 @@ def test_who_can_learn_together() -> None:
 @pytest.mark.parametrize(
     ("config", "observations", "actions", "named"),
     [
-        (DQNConfig(kind="dqn"), BOX, spaces.Discrete(2), "learner.kind: ppo"),
+        (DQNConfig(kind="dqn"), BOX, spaces.Discrete(2), "learner.kind: ppo or trpo"),
         (small(policy="CnnPolicy"), BOX, BOX, "learner.policy: MlpPolicy, not CnnPolicy"),
         (small(), spaces.Dict({"a": BOX}), BOX, "flat observations"),
         (small(), BOX, spaces.MultiDiscrete([2, 2]), "actions"),

@@ -18,12 +18,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.utils import explained_variance
 
-from space_dist.config import LearnerConfig, PPOConfig
+from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig
 from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
 from space_dist.learner.on_policy import Joined, OnPolicyLearner, mean_sizes
-from space_dist.learner.stacked import PPO, ROWS, PPOReport, PPOSettings, Samples, Shape, Stack, rounded_up
+from space_dist.learner.stacked import ACTOR, PPO, ROWS, PPOSettings, Report, Samples, Shape, Stack, rounded_up
+from space_dist.learner.trust_region import TRPO, TRPOSettings
 from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
 
@@ -55,7 +56,7 @@ class PopulationLearner(OnPolicyLearner):
 
     def __init__(
         self,
-        config: PPOConfig,
+        config: PPOConfig | TRPOConfig,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
         *,
@@ -87,42 +88,31 @@ class PopulationLearner(OnPolicyLearner):
             raise result
         return result
 
-    def begin(self, steps: int) -> PPOSettings:
-        """What the update that ends at `steps` environment steps learns with."""
-        model, config = self.model, self.settings
+    def begin(self, steps: int) -> float:
+        """The learning rate of the update that ends at `steps` environment steps."""
+        model = self.model
         model.num_timesteps = steps
         model._update_current_progress_remaining(steps, self._total_steps)
         model._update_learning_rate(model.policy.optimizer)
-        return PPOSettings(
-            learning_rate=model.policy.optimizer.param_groups[0]["lr"], clip_range=config.clip_range,
-            ent_coef=config.ent_coef, vf_coef=config.vf_coef, normalize_advantage=config.normalize_advantage,
-            max_grad_norm=math.inf if config.max_grad_norm is None else config.max_grad_norm,
-            target_kl=math.inf if config.target_kl is None else config.target_kl,
-        )  # fmt: skip
+        return float(model.policy.optimizer.param_groups[0]["lr"])
 
-    def conclude(self, stack: Stack, member: int, made: PPOReport, collected: _Round) -> Update:
-        """Take over a member's weights and Adam state, and report as SB3's PPO does."""
-        before, model, config = self._gradient_steps(), self.model, self.settings
+    def conclude(self, stack: Stack, member: int, made: Report, collected: _Round) -> Update:
+        """Take over a member's weights and Adam state, and report as SB3 does."""
+        before, model = self._gradient_steps(), self.model
         for name, parameter in model.policy.named_parameters():
             with torch.no_grad():
                 parameter.copy_(stack.parameter(stack.weights, name)[member])
-            model.policy.optimizer.state[parameter] = {
-                "step": stack.steps[member].to("cpu", copy=True),
-                "exp_avg": stack.parameter(stack.exp_avg, name)[member].cpu().clone(),
-                "exp_avg_sq": stack.parameter(stack.exp_avg_sq, name)[member].cpu().clone(),
-            }
-        model._n_updates += made.epochs
-        entropy, policy, value = made.entropy_losses, made.policy_losses, made.value_losses
+            if isinstance(self.settings, PPOConfig) or stack.layout.names[name][0] != ACTOR:  # TRPO's has no Adam
+                model.policy.optimizer.state[parameter] = {
+                    "step": stack.steps[member].to("cpu", copy=True),
+                    "exp_avg": stack.parameter(stack.exp_avg, name)[member].cpu().clone(),
+                    "exp_avg_sq": stack.parameter(stack.exp_avg_sq, name)[member].cpu().clone(),
+                }
+        model._n_updates += made.updates
         metrics = {
-            "entropy_loss": entropy.mean(),
-            "policy_gradient_loss": policy.mean(),
-            "value_loss": value.mean(),
-            "approx_kl": made.divergences[made.last_epoch :].mean(),
-            "clip_fraction": made.clip_fractions.mean(),
-            "loss": policy[-1] + config.ent_coef * entropy[-1] + config.vf_coef * value[-1],
+            **made.metrics,
             "explained_variance": explained_variance(_flat(collected.values), _flat(collected.returns)),
             "n_updates": model._n_updates,
-            "clip_range": config.clip_range,
         }
         if not self.shape.discrete:
             metrics["std"] = torch.exp(model.policy.log_std).mean().item()
@@ -135,8 +125,8 @@ class PopulationLearner(OnPolicyLearner):
 
 def refuse(config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Raise ConfigError where the population engine cannot learn."""
-    if not isinstance(config, PPOConfig):
-        raise ConfigError(f"engine: population learns with learner.kind: ppo, not {config.kind}")
+    if not isinstance(config, PPOConfig | TRPOConfig):
+        raise ConfigError(f"engine: population learns with learner.kind: ppo or trpo, not {config.kind}")
     if config.policy != "MlpPolicy":
         raise ConfigError(f"engine: population learns with learner.policy: MlpPolicy, not {config.policy}")
     if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
@@ -153,13 +143,20 @@ def refuse(config: LearnerConfig, observation_space: spaces.Space[Any], action_s
 def stack_key(config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Hashable:
     """Equal for learners that can be updated together. Raises ConfigError as `refuse`."""
     refuse(config, observation_space, action_space)
-    if not isinstance(config, PPOConfig):
+    if not isinstance(config, PPOConfig | TRPOConfig):
         raise TypeError(config)
     shape = _shape(config, observation_space, action_space)
-    return (config.kind, shape, config.n_steps, config.batch_size, config.n_epochs)
+    return (config.kind, shape, config.n_steps, config.batch_size, _passes(config))
 
 
-def _shape(config: PPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Shape:
+def _passes(config: PPOConfig | TRPOConfig) -> int:
+    """Permutations that an update draws: one for each epoch; or for the actor's step and each pass of the critic."""
+    return config.n_epochs if isinstance(config, PPOConfig) else 1 + config.n_critic_updates
+
+
+def _shape(
+    config: PPOConfig | TRPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> Shape:
     outputs = action_space.n if isinstance(action_space, spaces.Discrete) else np.prod(action_space.shape or ())
     return Shape(
         inputs=int(np.prod(observation_space.shape or ())), outputs=int(outputs),
@@ -189,10 +186,18 @@ def learn_together(
     stack = _stacked(members)
     collected, samples = _evaluated(stack, members, shards_of)
     config = members[0].settings
-    randoms = [_random(learner.seed, number) for learner, number in zip(members, round_of, strict=True)]
-    orders = (np.stack([random.permutation(config.n_steps) for random in randoms]) for _ in range(config.n_epochs))
-    settings = [learner.begin(reached) for learner, reached in zip(members, steps_of, strict=True)]
-    reports = PPO(stack, samples, settings, config.batch_size).run(orders)
+    seeds = [global_seeds(learner.seed, Purpose.UPDATE, at) for learner, at in zip(members, round_of, strict=True)]
+    # What SB3 draws permutations from, where NumPy's global generator is seeded for it.
+    randoms = [np.random.RandomState(for_numpy) for _, for_numpy, _ in seeds]
+    orders = (np.stack([random.permutation(config.n_steps) for random in randoms]) for _ in range(_passes(config)))
+    own = [(learner.settings, learner.begin(reached)) for learner, reached in zip(members, steps_of, strict=True)]
+    if isinstance(config, PPOConfig):
+        ppo = [_ppo(one, rate) for one, rate in own if isinstance(one, PPOConfig)]
+        reports = PPO(stack, samples, ppo, config.batch_size).run(orders)
+    else:
+        trpo = [_trpo(one, rate) for one, rate in own if isinstance(one, TRPOConfig)]
+        noise = torch.stack([_noise(stack, for_torch) for _, _, for_torch in seeds])
+        reports = TRPO(stack, samples, trpo, config.batch_size, noise).run(orders)
     finite = stack.finite()
     return [
         learner.conclude(stack, member, reports[member], collected[member])
@@ -202,9 +207,33 @@ def learn_together(
     ]
 
 
-def _random(seed: int, round: int) -> np.random.RandomState:
-    """What SB3 would draw an update's permutations from, were NumPy's global generator seeded for it."""
-    return np.random.RandomState(global_seeds(seed, Purpose.UPDATE, round)[1])
+def _ppo(config: PPOConfig, learning_rate: float) -> PPOSettings:
+    return PPOSettings(
+        learning_rate=learning_rate, clip_range=config.clip_range, ent_coef=config.ent_coef, vf_coef=config.vf_coef,
+        normalize_advantage=config.normalize_advantage,
+        max_grad_norm=math.inf if config.max_grad_norm is None else config.max_grad_norm,
+        target_kl=math.inf if config.target_kl is None else config.target_kl,
+    )  # fmt: skip
+
+
+def _trpo(config: TRPOConfig, learning_rate: float) -> TRPOSettings:
+    return TRPOSettings(
+        learning_rate=learning_rate, target_kl=config.target_kl, normalize_advantage=config.normalize_advantage,
+        cg_max_steps=config.cg_max_steps, cg_damping=config.cg_damping,
+        line_search_shrinking_factor=config.line_search_shrinking_factor,
+        line_search_max_iter=config.line_search_max_iter,
+    )  # fmt: skip
+
+
+def _noise(stack: Stack, seed: int) -> torch.Tensor:
+    """What sb3-contrib starts conjugate gradients from, where torch's global generator is seeded for it."""
+    count = sum(
+        stack.parameter(stack.weights, name)[0].numel()
+        for name, (network, _, _) in stack.layout.names.items()
+        if network == ACTOR
+    )
+    noise = torch.randn(count, dtype=stack.dtype, generator=torch.Generator().manual_seed(seed))
+    return noise.to(stack.device)
 
 
 def _stacked(members: Sequence[PopulationLearner]) -> Stack:
@@ -318,8 +347,9 @@ def _advantages(
     """
     advantages = np.empty_like(rewards)
     following, behind = np.zeros_like(last_values), last_values
-    for time in range(len(rewards) - 1, -1, -1):
-        going_on = 1 - ended[time].astype(np.float32)
-        following = rewards[time] + gammas * behind * going_on - values[time] + decays * going_on * following
-        advantages[time], behind = following, values[time]
+    with np.errstate(invalid="ignore"):  # of infinite rewards: the update says that training diverged
+        for time in range(len(rewards) - 1, -1, -1):
+            going_on = 1 - ended[time].astype(np.float32)
+            following = rewards[time] + gammas * behind * going_on - values[time] + decays * going_on * following
+            advantages[time], behind = following, values[time]
     return advantages

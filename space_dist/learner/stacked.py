@@ -160,11 +160,16 @@ class Stack:
 
 
 class Networks:
-    """Forward and backward passes of R networks, one for each row of `weights` (R, length), on `rows` inputs each."""
+    """Forward and backward passes of R networks, one for each row of `weights` (R, length), on `rows` inputs each.
 
-    def __init__(self, stack: Stack, weights: torch.Tensor, gradient: torch.Tensor, rows: int) -> None:
-        layout, shape = stack.layout, stack.shape
-        count = len(weights)
+    keep: whether what a forward pass found is still there after a backward pass.
+    """
+
+    def __init__(
+        self, stack: Stack, weights: torch.Tensor, gradient: torch.Tensor, rows: int, *, keep: bool = False
+    ) -> None:
+        self._layout = layout = stack.layout
+        shape, count = stack.shape, len(weights)
         self._tanh = shape.activation == "tanh"
         self._weights = [place.of(weights) for place in layout.weights]
         self._biases = [place.of(weights)[:, None, :] for place in layout.biases[:-1]]
@@ -179,7 +184,7 @@ class Networks:
         # Where a layer above is done with its units when this one's gradient comes, that lies where it is in the cache.
         above = itertools.zip_longest(shape.hidden, self._hidden[1:])
         self._hidden_gradients = [
-            empty(rows, n) if units is None or units.shape[2] != n else units for n, units in above
+            empty(rows, n) if keep or units is None or units.shape[2] != n else units for n, units in above
         ]  # fmt: skip
         self._scratch = [empty(*place.shape) for place in layout.weights]
         self.outputs = empty(shape.outputs, rows)
@@ -201,6 +206,29 @@ class Networks:
         turned = self._hidden_turned[-1] if self._hidden else inputs.transpose(1, 2)
         return torch.baddbmm(self._biases[-1], self._weights[-1], turned, out=self.outputs)
 
+    def tangent(self, inputs: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        """`(R, outputs, rows)` derivatives of the last `forward`'s outputs along (R, length) `directions`."""
+        found: torch.Tensor | None = None
+        for layer, hidden in enumerate(self._hidden):
+            weights = self._layout.weights[layer].of(directions)
+            bias = self._layout.biases[layer].of(directions)[:, None, :]
+            moved = torch.baddbmm(bias, inputs, weights)
+            if found is not None:
+                moved.baddbmm_(found, self._weights[layer])
+            found = self._through(moved, hidden)
+            inputs = hidden
+        bias = self._layout.biases[-1].of(directions)[:, :, None]
+        moved = torch.baddbmm(bias, self._layout.weights[-1].of(directions), inputs.transpose(1, 2))
+        return moved if found is None else moved.baddbmm_(self._weights[-1], found.transpose(1, 2))
+
+    def _through(self, derivatives: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
+        """Derivatives times those of the activation that gave `hidden`, in place."""
+        if self._tanh:
+            torch.ops.aten.tanh_backward.grad_input(derivatives, hidden, grad_input=derivatives)
+        else:
+            torch.ops.aten.threshold_backward.grad_input(derivatives, hidden, 0.0, grad_input=derivatives)
+        return derivatives
+
     def backward(self, inputs: torch.Tensor) -> None:
         """Write the gradient of every weight, given `output_gradients`, of the last `forward`'s `inputs`."""
         given = self.output_gradients
@@ -214,10 +242,7 @@ class Networks:
                 torch.bmm(self._output_gradients_turned[0], self._weights[-1], out=gradient)
             else:
                 torch.bmm(given, self._weights_turned[layer + 1], out=gradient)
-            if self._tanh:
-                torch.ops.aten.tanh_backward.grad_input(gradient, hidden, grad_input=gradient)
-            else:
-                torch.ops.aten.threshold_backward.grad_input(gradient, hidden, 0.0, grad_input=gradient)
+            self._through(gradient, hidden)
             turned = self._hidden_turned[layer - 1] if layer else inputs.transpose(1, 2)
             torch.bmm(turned, gradient, out=self._scratch[layer])
             self._weight_gradients[layer].copy_(self._scratch[layer])
@@ -249,7 +274,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class PPOSettings:
-    """One member's own. max_grad_norm: infinite where gradients are not clipped.  target_kl: likewise, epochs."""
+    """One member's own. max_grad_norm, target_kl: infinite for none."""
 
     learning_rate: float
     clip_range: float
@@ -261,23 +286,14 @@ class PPOSettings:
 
 
 @dataclass(frozen=True)
-class PPOReport:
-    """One member's minibatches, in order, the last one of which may have been refused by target_kl.
+class Report:
+    """What one member's update says of itself. metrics: under SB3's names.  updates: by how many its count grows."""
 
-    policy_losses, value_losses, entropy_losses, divergences, clip_fractions: (minibatches,).  epochs: begun.
-    last_epoch: the first minibatch of the last epoch.
-    """
-
-    policy_losses: Array
-    value_losses: Array
-    entropy_losses: Array
-    divergences: Array
-    clip_fractions: Array
-    epochs: int
-    last_epoch: int
+    metrics: dict[str, float]
+    updates: int
 
 
-class _Minibatches:
+class Minibatches:
     """`count` minibatches of `size` samples a member, drawn anew each epoch into the same memory.
 
     Everything has `rows`, a multiple of ROWS, instead of `size`; those too many are samples that count nothing.
@@ -331,36 +347,33 @@ class _Minibatches:
         self.pulls[:, :, size:] = 0.0
 
 
+def parts_of(stack: Stack, samples: Samples, size: int, normalized: torch.Tensor) -> list[Minibatches]:
+    """An epoch's minibatches: those of `size`, and the smaller one that is left, if any."""
+    whole, rest = divmod(samples.returns.shape[1], size)
+    kinds = ((size, whole), (rest, 1))
+    return [Minibatches(stack, samples, each, count, normalized) for each, count in kinds if each * count]
+
+
 class PPO:
     """The epochs of one update of all members."""
 
     def __init__(
         self, stack: Stack, samples: Samples, settings: Sequence[PPOSettings], batch_size: int
     ) -> None:  # fmt: skip
-        self._stack = stack
-        count = samples.returns.shape[1]
-        whole, rest = divmod(count, batch_size)
-
-        def column(numbers: Iterable[float], dtype: torch.dtype = stack.dtype) -> torch.Tensor:
-            return torch.tensor(list(numbers), dtype=torch.float64).to(stack.device, dtype)[:, None]
-
-        self._entropy = column(one.ent_coef for one in settings)
-        self._vf = column(one.vf_coef for one in settings)
-        self._max_norm = column(one.max_grad_norm for one in settings)
-        self._clip = column(one.clip_range for one in settings)
-        self._low = column(1.0 - one.clip_range for one in settings)
-        self._high = column(1.0 + one.clip_range for one in settings)
-        self._limits = column(1.5 * one.target_kl for one in settings)[:, 0]
+        self._stack, self._settings = stack, settings
+        self._entropy = column(stack, (one.ent_coef for one in settings))
+        self._vf = column(stack, (one.vf_coef for one in settings))
+        self._max_norm = column(stack, (one.max_grad_norm for one in settings))
+        self._clip = column(stack, (one.clip_range for one in settings))
+        self._low = column(stack, (1.0 - one.clip_range for one in settings))
+        self._high = column(stack, (1.0 + one.clip_range for one in settings))
+        self._limits = column(stack, (1.5 * one.target_kl for one in settings))[:, 0]
         self._watched = any(math.isfinite(one.target_kl) for one in settings)
-        normalized = column((float(one.normalize_advantage) for one in settings), torch.float32)
-        self._parts = [
-            _Minibatches(stack, samples.of(stack.dtype), size, number, normalized)
-            for size, number in ((batch_size, whole), (rest, 1))
-            if size * number
-        ]
+        normalized = column(stack, (float(one.normalize_advantage) for one in settings), torch.float32)
+        self._parts = parts_of(stack, samples.of(stack.dtype), batch_size, normalized)
         self._adam = Adam(stack, [one.learning_rate for one in settings])
 
-    def run(self, orders: Iterable[NDArray[np.int64]]) -> list[PPOReport]:
+    def run(self, orders: Iterable[NDArray[np.int64]]) -> list[Report]:
         """One epoch for each (P, N) of `orders`: each member's permutation of its samples."""
         members = self._stack.members
         self._active = [True] * members
@@ -378,13 +391,27 @@ class PPO:
             if not any(self._active):
                 break
         columns = [torch.cat(parts).cpu().numpy() for parts in zip(*records, strict=True)]
-        reports = []
-        for member in range(members):
-            policy, value, entropy, divergence, clipped = (column[: made[member], member] for column in columns)
-            reports.append(PPOReport(policy, value, entropy, divergence, clipped, epochs[member], last[member]))
-        return reports
+        return [
+            self._report(member, [column[: made[member], member] for column in columns], epochs[member], last[member])
+            for member in range(members)
+        ]
 
-    def _learn(self, batches: _Minibatches, made: list[int]) -> tuple[torch.Tensor, ...]:
+    def _report(self, member: int, columns: Sequence[Array], epochs: int, last: int) -> Report:
+        """Of a member's minibatches, the last of which may have been refused by `target_kl`; `last`: epoch's first."""
+        policy, value, entropy, divergence, clipped = columns
+        own = self._settings[member]
+        metrics = {
+            "entropy_loss": entropy.mean(),
+            "policy_gradient_loss": policy.mean(),
+            "value_loss": value.mean(),
+            "approx_kl": divergence[last:].mean(),
+            "clip_fraction": clipped.mean(),
+            "loss": policy[-1] + own.ent_coef * entropy[-1] + own.vf_coef * value[-1],
+            "clip_range": own.clip_range,
+        }
+        return Report({name: float(metric) for name, metric in metrics.items()}, epochs)
+
+    def _learn(self, batches: Minibatches, made: list[int]) -> tuple[torch.Tensor, ...]:
         """All minibatches. Returns (count, P) policy, value and entropy losses, divergences, clip fractions."""
         stack, members, size, rows = self._stack, self._stack.members, batches.size, batches.rows
         networks = stack.networks(rows)
@@ -454,7 +481,7 @@ class Gaussian:
 
     def __init__(self, stack: Stack, means: torch.Tensor, gradients: torch.Tensor) -> None:
         place, self._dimensions = stack.layout.log_std, stack.shape.outputs
-        width = rounded_up(self._dimensions, 16)
+        width = rounded_up(self._dimensions, ROWS)
         self._means, self._gradients = means, gradients
         self._wide = stack.weights[:, ACTOR, :width]  # whole vectors
         self._log_std, self._log_std_gradient = place.of(stack.weights)[:, ACTOR], place.of(stack.gradient)[:, ACTOR]
@@ -477,6 +504,26 @@ class Gaussian:
         curvature = weighted.mul_(self._z).sum(2)
         torch.sub(curvature, pull.sum(1, keepdim=True).add_(entropy), out=self._log_std_gradient)
 
+    def remember(self) -> None:
+        """Take the distribution of the last `log_prob` for the old one."""
+        self._old_means, self._old_inverse, self._old_wide = self._means.clone(), self._inverse, self._wide.clone()
+
+    def divergence(self, size: int) -> torch.Tensor:
+        """`(P,)` means of KL(of the last `log_prob` || old) over samples and, as in sb3-contrib, action dimensions."""
+        distances = (self._means - self._old_means).mul_(self._old_inverse).square_()[:, :, :size].mean((1, 2))
+        logarithms = (self._wide - self._old_wide).mul_(2.0)
+        spreads = logarithms.exp().sub_(1.0).sub_(logarithms)[:, : self._dimensions].mean(1)
+        return distances.add_(spreads).mul_(0.5)
+
+    def curvature(self, tangents: torch.Tensor, directions: torch.Tensor, size: int) -> None:
+        """Gradients of the product of the Hessian of `divergence` with a direction.
+
+        tangents: (P, n, rows) derivatives of the means along it.  directions: (P, length).
+        """
+        torch.mul(tangents, self._inverse.square() / (size * self._dimensions), out=self._gradients)
+        self._gradients[:, :, size:] = 0.0
+        torch.mul(directions[:, : self._dimensions], 2.0 / self._dimensions, out=self._log_std_gradient)
+
 
 class Categorical:
     """Discrete actions; the actor's outputs are logits."""
@@ -489,11 +536,11 @@ class Categorical:
         self._actions = actions
         self._log_probs = torch.log_softmax(self._logits, dim=1)
         self._probs = torch.exp(self._log_probs)
+        self._entropies = (self._probs * self._log_probs).sum(1, keepdim=True).neg_()
         torch.add(self._log_probs.gather(1, actions)[:, 0], offset, out=out)
 
     def entropy(self, out: torch.Tensor) -> None:
         """As `Gaussian.entropy`."""
-        self._entropies = (self._probs * self._log_probs).sum(1, keepdim=True).neg_()
         torch.mean(self._entropies[:, 0, : self._size], dim=1, out=out)
 
     def backward(self, pull: torch.Tensor, entropy: torch.Tensor) -> None:
@@ -504,6 +551,20 @@ class Categorical:
         self._gradients.copy_(bonus)
         self._gradients[:, :, self._size :] = 0.0
 
+    def remember(self) -> None:
+        """As `Gaussian.remember`."""
+        self._old_log_probs = self._log_probs
+
+    def divergence(self, size: int) -> torch.Tensor:
+        """As `Gaussian.divergence`."""
+        return (self._probs * (self._log_probs - self._old_log_probs)).sum(1)[:, :size].mean(1)
+
+    def curvature(self, tangents: torch.Tensor, directions: torch.Tensor, size: int) -> None:  # noqa: ARG002 - no log_std
+        """As `Gaussian.curvature`."""
+        means = (self._probs * tangents).sum(1, keepdim=True)
+        torch.mul(self._probs, tangents - means, out=self._gradients).div_(size)
+        self._gradients[:, :, size:] = 0.0
+
 
 def head_of(stack: Stack, outputs: torch.Tensor, gradients: torch.Tensor, size: int) -> Gaussian | Categorical:
     """The distribution of actions, given the (P, n, rows) outputs of actors, of which `size` rows count."""
@@ -511,10 +572,16 @@ def head_of(stack: Stack, outputs: torch.Tensor, gradients: torch.Tensor, size: 
 
 
 class Adam:
-    """torch's Adam with a learning rate for each member; members may sit steps out."""
+    """torch's Adam with a learning rate for each member; members may sit steps out.
 
-    def __init__(self, stack: Stack, learning_rates: Sequence[float]) -> None:
+    networks: which of a member's learn.
+    """
+
+    def __init__(self, stack: Stack, learning_rates: Sequence[float], networks: slice = slice(None)) -> None:
         self._stack, self._rates = stack, learning_rates
+        self._weights, self._gradient, self._averages, self._squares = (
+            rows[:, networks] for rows in (stack.weights, stack.gradient, stack.exp_avg, stack.exp_avg_sq)
+        )
         self._columns = torch.tensor(learning_rates, dtype=torch.float64, device=stack.device)
         self.move([True] * stack.members)
 
@@ -523,7 +590,7 @@ class Adam:
         stack = self._stack
         self._active = torch.tensor(active, dtype=torch.float32, device=stack.device)
         self._groups: dict[float, tuple[list[torch.Tensor], ...]] = {}  # by learning rate: what the kernel takes
-        tensors = (stack.weights, stack.gradient, stack.exp_avg, stack.exp_avg_sq, stack.steps)
+        tensors = (self._weights, self._gradient, self._averages, self._squares, stack.steps)
         for member, rate in enumerate(self._rates):
             if active[member]:
                 lists = self._groups.setdefault(rate, tuple([] for _ in tensors))
@@ -548,13 +615,18 @@ class Adam:
     def _together(self) -> None:
         """Without a kernel for each member: for devices where starting one is what costs."""
         stack, active = self._stack, self._active[:, None, None]
-        gradient = torch.where(active > 0.0, stack.gradient, 0.0)
-        stack.exp_avg.lerp_(gradient, (1.0 - BETAS[0]) * active.to(stack.dtype))
-        stack.exp_avg_sq.lerp_(gradient.square_(), (1.0 - BETAS[1]) * active.to(stack.dtype))
+        gradient = torch.where(active > 0.0, self._gradient, 0.0)
+        self._averages.lerp_(gradient, (1.0 - BETAS[0]) * active.to(stack.dtype))
+        self._squares.lerp_(gradient.square_(), (1.0 - BETAS[1]) * active.to(stack.dtype))
         first, second = (1.0 - beta ** stack.steps.double().clamp(min=1.0) for beta in BETAS)
         rates, roots = (self._columns * self._active / first).to(stack.dtype), second.sqrt().to(stack.dtype)
-        denominators = stack.exp_avg_sq.sqrt().div_(roots[:, None, None]).add_(EPS)
-        stack.weights.sub_(stack.exp_avg.div(denominators).mul_(rates[:, None, None]))
+        denominators = self._squares.sqrt().div_(roots[:, None, None]).add_(EPS)
+        self._weights.sub_(self._averages.div(denominators).mul_(rates[:, None, None]))
+
+
+def column(stack: Stack, numbers: Iterable[float], dtype: torch.dtype | None = None) -> torch.Tensor:
+    """`(P, 1)` a number of each member."""
+    return torch.tensor(list(numbers), dtype=torch.float64).to(stack.device, dtype or stack.dtype)[:, None]
 
 
 def split(tensor: torch.Tensor, axis: int, shape: tuple[int, ...]) -> torch.Tensor:
