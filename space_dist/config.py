@@ -772,8 +772,8 @@ class RunConfig(Section):
     def _population_shares_a_curriculum(self) -> Self:
         if self.members == 1:
             return self
-        if self.engine == "single" or not isinstance(self.learner, PPOConfig):
-            raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo")
+        if self.engine == "single" or not isinstance(self.learner, PPOConfig | TRPOConfig):
+            raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo or trpo")
         if self.learner.normalize_observations or self.learner.normalize_rewards:
             raise ValueError(
                 "curriculum.aggregate: population cannot be combined with learner.normalize_observations or "

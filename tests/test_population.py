@@ -32,10 +32,12 @@ Ends = dict[Path, Outcome | SpaceDistError]
 def configured(folder: Path, number: int, **sections: Any) -> RunConfig:
     """Member `number` of a population of runs that differ in all that members may."""
     folder.mkdir(parents=True, exist_ok=True)
-    numbers = {"learning_rate": 1e-3 * (number + 1), "gamma": 0.9 - 0.05 * number, "clip_range": 0.1 + 0.05 * number}
+    learner = sections.pop("learner", {})
+    kind, own = learner.pop("kind", "ppo"), {"ppo": "clip_range", "trpo": "target_kl"}
+    numbers = {"learning_rate": 1e-3 * (number + 1), "gamma": 0.9 - 0.05 * number, own[kind]: 0.1 + 0.05 * number}
     curricula = ({"kind": "space"}, {"kind": "round_robin"}, {"kind": "space", "kappa": 2, "eta": 0.5}, {"kind": "plr"})
     config = config_for(
-        folder, learner_section("ppo", **{**numbers, **sections.pop("learner", {})}),
+        folder, learner_section(kind, **{**numbers, **learner}),
         curriculum=curricula[number % len(curricula)], engine="population", seed=number, **sections,
     )  # fmt: skip
     write_set(folder / "train.csv", np.linspace(-1.0, 1.0 - number / 11, 6 + number))
@@ -60,12 +62,15 @@ def alone(config: RunConfig, folder: Path) -> dict[str, bytes]:
     return results(folder)
 
 
-@pytest.mark.parametrize("env_id", [LINE, DISCRETE])
-@pytest.mark.parametrize("normalised", [False, True])
-def test_a_member_is_what_its_run_is_alone(env_id: str, normalised: bool, tmp_path: Path) -> None:
-    learner = {"normalize_observations": normalised, "normalize_rewards": normalised}
+@pytest.mark.parametrize(
+    ("kind", "env_id", "normalised"),
+    [("ppo", LINE, False), ("ppo", LINE, True), ("ppo", DISCRETE, False), ("trpo", LINE, True),
+     ("trpo", DISCRETE, False)],
+)  # fmt: skip
+def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: bool, tmp_path: Path) -> None:
+    learner = {"kind": kind, "normalize_observations": normalised, "normalize_rewards": normalised}
     configs = [
-        configured(tmp_path / str(number), number, env={"id": env_id}, learner=learner,
+        configured(tmp_path / str(number), number, env={"id": env_id}, learner={**learner},
                    evaluation={"every_steps": 100, "legacy_metric": True})
         for number in range(4)
     ]  # fmt: skip
@@ -236,7 +241,7 @@ def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [({"engine": "single"}, "needs engine: population"),
-     ({"learner": learner_section("trpo")}, "learner.kind: ppo"),
+     ({"learner": learner_section("a2c")}, "learner.kind: ppo"),
      ({"learner": learner_section("ppo", normalize_rewards=True)}, "normalize_rewards")],
 )  # fmt: skip
 def test_who_cannot_share_a_curriculum_is_told_so(changes: dict[str, Any], words: str, tmp_path: Path) -> None:

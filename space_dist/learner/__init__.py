@@ -52,7 +52,7 @@ def make_learner(
     Raises ConfigError if the learner cannot work with these spaces.
     """
     torch.set_num_threads(1)  # 1 and 2 threads give different gradients
-    if population and isinstance(config, PPOConfig):
+    if population and isinstance(config, PPOConfig | TRPOConfig):
         return PopulationLearner(
             config, observation_space, action_space,
             seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
