@@ -731,8 +731,8 @@ class RunConfig(Section):
     (PPO and TRPO with MlpPolicy); a grid puts such runs together, and one alone has the same bits. auto: population
     where the learner allows it; decided when a grid is frozen or a run begins. Part of what a run is."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where updates are computed; cuda: a GPU, with engine: population, where up to 1,024 runs share a process. There, a
-    member's last bits depend on its companions. Part of what a run is."""
+    """Where updates are computed; cuda: a GPU, with engine: population, where up to 1,024 runs share a process. A
+    member's last bits depend on its companions there. Part of what a run is."""
     env: EnvConfig
     instances: InstancesConfig
     curriculum: CurriculumConfig
