@@ -98,7 +98,11 @@ def throughput(
         for name, rows in table.items():
             for row in rows.values():
                 row.rates.append(row.measure())
-                console.print(f"round {number + 1}, {name}: {row.title}: {row.rates[-1]:,.0f} steps/s", markup=False)
+                console.print(
+                    f"round {number + 1}, {name}: {row.title}: {row.rates[-1]:,.0f} steps/s",
+                    markup=False,
+                    soft_wrap=True,
+                )
     ratios = {
         name: _ratio(table[task][ours], table[task][rival])
         for name, (task, ours, rival) in PAIRS.items()
@@ -106,7 +110,7 @@ def throughput(
     }
     projected = _table1(member_steps) if "table1" in parts else {}
     text = _markdown(table, ratios, projected, rounds)
-    console.print(text, markup=False)
+    console.print(text, markup=False, soft_wrap=True)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "throughput.md").write_text(text)
@@ -160,7 +164,10 @@ def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contend
     rates = {contender: _rate(task, contender, seconds / 2.0, patience=PATIENCE) for contender in contenders}
     for contender, rate in rates.items():
         console.print(
-            f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s", style="dim", markup=False
+            f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s",
+            style="dim",
+            markup=False,
+            soft_wrap=True,
         )
     return max(rates, key=lambda contender: rates[contender])
 
@@ -343,7 +350,7 @@ def _figure(table: dict[str, dict[str, Row]], file: Path) -> None:
             axis.text(max(row.rates), position, f"  {row.rate:,.0f}", va="center", fontsize=8)
         axis.margins(x=0.15)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[-1, 0].set_xlabel("environment steps per second, collecting and learning; median, least and most")
+    figure.supxlabel("environment steps per second, collecting and learning: median, least and most", fontsize=9)
     figure.savefig(file, dpi=150)
     plt.close(figure)
 
