@@ -212,9 +212,6 @@ class _Workshop:
     def _compute_apart(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
         for promise in promised:
             self.close()  # nobody knows what state an environment is in that has failed
-            if isinstance(promise.work, Trial) and promise.work.random is not None:
-                promise.value = SpaceDistError("the environment failed while episodes were measured")
-                continue
             try:
                 self._compute(batch, [promise])
             except Exception as error:

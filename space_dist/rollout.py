@@ -8,7 +8,8 @@ often, it gives the same bits.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -152,14 +153,14 @@ class Rollout:
 class Trial:
     """Episodes to be measured, one per row of `contexts` (k, d), with `seeds` (k,).
 
-    Deterministic ones, unless there is `random` to act with.
+    Deterministic ones, unless there is a `random` generator, made anew each time, to act with.
     """
 
     policy: Policy
     contexts: FloatArray
     seeds: NDArray[np.uint64]
     gamma: float
-    random: np.random.Generator | None = None
+    random: Callable[[], np.random.Generator] | None = None
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -239,14 +240,14 @@ class Setup:
         return Trial(
             self._member(policy, part), instances.contexts[mine // self.evaluation_episodes],
             episode_seeds(self.seed, Purpose.EVALUATION, number, count=count)[mine], self.gamma,
-            generator(self.seed, Purpose.EVALUATION, 2 + number, part) if stochastic else None,
+            functools.partial(generator, self.seed, Purpose.EVALUATION, 2 + number, part) if stochastic else None,
         )  # fmt: skip
 
     def probe(self, policy: Policy, indices: IntArray, version: int, part: int) -> Trial:
         """Episodes of the acting policy, noise and all, on one part of the training instances at (k,) `indices`."""
         seeds = episode_seeds(self.seed, Purpose.PROBE_EPISODES, version, count=len(indices))
         mine = np.array_split(np.arange(len(indices)), self.evaluation_parts)[part]
-        random = generator(self.seed, Purpose.PROBE_EPISODES, version, part)
+        random = functools.partial(generator, self.seed, Purpose.PROBE_EPISODES, version, part)
         return Trial(policy, self.train.contexts[indices[mine]], seeds[mine], self.gamma, random)
 
 
@@ -417,7 +418,7 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
     noise = None
     if trials[0].random is not None:
         shape = (env.horizon, count)
-        noise = Noise.joined([Noise.draw(trial.policy.head, env.action_space, trial.random, shape)
+        noise = Noise.joined([Noise.draw(trial.policy.head, env.action_space, trial.random(), shape)
                               for trial in trials if trial.random is not None])  # fmt: skip
     contexts = np.concatenate([trial.contexts for trial in trials])
     seeds = np.concatenate([trial.seeds for trial in trials])

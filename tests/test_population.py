@@ -162,8 +162,9 @@ def make_fragile(n_slots: int) -> Fragile:
 
 def test_who_breaks_an_environment_fails_alone(tmp_path: Path) -> None:
     """The environments of all members are one batch; only those whose contexts break it must bear that."""
-    configs = [configured(tmp_path / str(number), number, env={"id": "tests.test_population:make_fragile"})
-               for number in range(3)]  # fmt: skip
+    settings = {"env": {"id": "tests.test_population:make_fragile"},
+                "evaluation": {"every_steps": 100, "legacy_metric": True}}  # fmt: skip
+    configs = [configured(tmp_path / str(number), number, **settings) for number in range(3)]
     folders = [tmp_path / f"run{number}" for number in range(3)]  # the first one's instances reach 1
     ends = together(configs, folders)
     assert "broken at its end" in str(ends[folders[0]])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -604,7 +605,8 @@ def test_outcomes_are_the_same_whatever_is_measured_beside_them(env_id: str, nor
             random = np.random.default_rng(seed)
             contexts = random.uniform(bounds.low, bounds.high, size=(7, len(bounds.names)))
             seeds = random.integers(1 << 62, size=7).astype(np.uint64)
-            made.append(Trial(policy, contexts, seeds, 0.9 + seed / 100, random if noisy else None))
+            noise = functools.partial(np.random.default_rng, seed)
+            made.append(Trial(policy, contexts, seeds, 0.9 + seed / 100, noise if noisy else None))
         return made
 
     alone = [evaluate(make_batched(env_id, 7, context_visible=True), [trial])[0] for trial in trials()]
