@@ -77,6 +77,7 @@ def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
     say(
         f"{len(manifest.cells)} cells x {len(manifest.seeds)} seeds = {len(found)} runs, {made.steps:,} environment "
         f"steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
+        + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )
     other = sum(standing.other_code for standing in done)
     say(f"done already: {len(done)} runs" + (f", {other} of them by another version of this package" if other else ""))
