@@ -730,6 +730,9 @@ class RunConfig(Section):
     """How updates are computed. single: by SB3 itself. population: the same losses for many runs of one shape at once
     (PPO and TRPO with MlpPolicy); a grid puts such runs together, and one alone has the same bits. auto: population
     where the learner allows it; decided when a grid is frozen or a run begins. Part of what a run is."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where updates are computed; cuda: a GPU, with engine: population, where up to 1,024 runs share a process. A
+    member's last bits depend on its companions there. Part of what a run is."""
     env: EnvConfig
     instances: InstancesConfig
     curriculum: CurriculumConfig
@@ -761,6 +764,10 @@ class RunConfig(Section):
 
     @model_validator(mode="after")
     def _one_way_to_update(self) -> Self:
+        if self.device == "cuda" and self.engine != "population":
+            raise ValueError(
+                f"device: cuda needs engine: population, not {self.engine}: a single run is faster on a CPU"
+            )
         if self.engine == "population" and isinstance(self.learner, PPOConfig) and self.learner.update != "stock":
             raise ValueError(
                 f"learner.update: {self.learner.update} says nothing with engine: population, which has updates of its "

@@ -39,7 +39,7 @@ _TICK_SECONDS = 0.2
 _ELSEWHERE_SECONDS = 2.0
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0
-MEMBERS = 32  # of a population, at most: more gain little, and are lost together
+MEMBERS = {"cpu": 32, "cuda": 1024}  # of a population, at most: more gain little, and are lost together
 
 
 # ---- from a file to a manifest --------------------------------------------------------------------------------------
@@ -321,7 +321,10 @@ class Conductor:
         if not ready or not ready[0].cell.stack:
             return ready[:1]
         alike = [run for run in ready if run.cell.stack == ready[0].cell.stack]
-        return alike[: min(MEMBERS, -(-len(alike) // max(1, self._executor.size - self._places_taken())))]
+        device = ready[0].cell.config["device"]
+        if device == "cuda":  # whose room no core's share of the runs would fill
+            return alike[: MEMBERS[device]]
+        return alike[: min(MEMBERS[device], -(-len(alike) // max(1, self._executor.size - self._places_taken())))]
 
     def _places_taken(self) -> int:
         return self._executor.size - self._executor.room() if self._live else 0

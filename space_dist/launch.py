@@ -27,6 +27,7 @@ from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
+from space_dist.learner import refuse_device
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
 from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
@@ -130,6 +131,7 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
     ledger, config = Ledger(folder), resolved(config)
     train, test = read_instances(config)
     setup = make_setup(config, train, test)
+    refuse_device(config.device)
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:

@@ -711,7 +711,11 @@ def stack_of(config: RunConfig) -> str:
     if config.engine != "population":
         return ""
     env = make_env(config)
-    key = (config.env.model_dump_json(), stack_key(config.learner, env.observation_space, env.action_space))
+    key = (
+        config.env.model_dump_json(),
+        config.device,
+        stack_key(config.learner, env.observation_space, env.action_space),
+    )
     return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
 
 
@@ -729,7 +733,7 @@ def _learner_of(config: RunConfig, seed: int) -> Learner:
         config.learner, env.observation_space, env.action_space,
         seed=seed, n_slots=config.rollout.shards * config.rollout.slots,
         slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
-        population=config.engine == "population",
+        population=config.engine == "population", device=config.device,
     )  # fmt: skip
 
 

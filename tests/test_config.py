@@ -727,6 +727,7 @@ def test_identity_depends_on_what_only_some_learners_can() -> None:
     shared = "curriculum={kind: space, aggregate: population}"
     assert ident(load(SPACE, ["engine=population", shared])) != ident(load(SPACE, ["engine=population"]))
     assert ident(load(SPACE, ["rollout.overlap=true"])) != ident(load(SPACE))
+    assert len({ident(load(SPACE, ["engine=population", f"device={device}"])) for device in ("cpu", "cuda")}) == 2
 
 
 def test_identity_depends_on_the_kinds() -> None:

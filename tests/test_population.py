@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
@@ -249,3 +250,11 @@ def test_who_cannot_share_a_curriculum_is_told_so(changes: dict[str, Any], words
     curriculum = {"kind": "space", "aggregate": "population"}
     with pytest.raises(ConfigError, match=words):
         config_for(tmp_path, learner, **{"curriculum": curriculum, "engine": "population", **changes})
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_missed_before_anything_starts(tmp_path: Path) -> None:
+    config = config_for(tmp_path, learner_section("ppo"), engine="population", device="cuda")
+    with pytest.raises(ConfigError, match="device: cuda: torch finds no GPU"):
+        alone(config, tmp_path / "run")
+    assert not (tmp_path / "run").exists()

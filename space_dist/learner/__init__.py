@@ -44,18 +44,19 @@ def make_learner(
     slot_length: int,
     total_steps: int,
     population: bool = False,
+    device: str = "cpu",
 ) -> Learner:
     """A config's learner with its initial networks, seeded.
 
     n_slots, slot_length: of a round, over all shards; total_steps: of the run, for schedules. population: one whose
-    updates can be made together with others'.
+    updates can be made together with others', on `device`.
     Raises ConfigError if the learner cannot work with these spaces.
     """
     torch.set_num_threads(1)  # 1 and 2 threads give different gradients
     if population and isinstance(config, PPOConfig | TRPOConfig):
         return PopulationLearner(
             config, observation_space, action_space,
-            seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
+            seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps, device=device,
         )  # fmt: skip
     if isinstance(config, PPOConfig | TRPOConfig | A2CConfig):
         return OnPolicyLearner(
@@ -64,6 +65,12 @@ def make_learner(
         )  # fmt: skip
     kinds: dict[type, type[OffPolicyLearner]] = {DQNConfig: DQNLearner, SACConfig: SACLearner, TD3Config: TD3Learner}
     return kinds[type(config)](config, observation_space, action_space, seed=seed, total_steps=total_steps)
+
+
+def refuse_device(device: str) -> None:
+    """Raise ConfigError where updates cannot be computed on `device`, here."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device: cuda: torch finds no GPU on this machine; use device: cpu")
 
 
 def preload() -> None:
@@ -99,6 +106,7 @@ __all__ = [
     "make_ensemble",
     "make_learner",
     "preload",
+    "refuse_device",
     "refuse_population",
     "refuse_spaces",
     "stack_key",
