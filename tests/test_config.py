@@ -640,6 +640,7 @@ COMPANIONS: dict[str, dict[str, Any]] = {
 }
 # Valid only together with others; see the tests of the fixed subset, the target, and what only some learners can.
 INSEPARABLE = (
+    "device",
     "curriculum.aggregate",
     "rollout.overlap",
     "curriculum.ids",
