@@ -67,6 +67,7 @@ class PopulationLearner(OnPolicyLearner):
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
     ) -> None:
+        torch.set_num_threads(1)  # 1 and 2 threads give different gradients
         refuse(config, observation_space, action_space)
         super().__init__(
             config, observation_space, action_space,

@@ -162,7 +162,7 @@ class Stack:
 class Networks:
     """Forward and backward passes of R networks, one for each row of `weights` (R, length), on `rows` inputs each.
 
-    keep: whether what a forward pass found is still there after a backward pass.
+    keep: whether what a forward pass found is still there after a backward pass, for `tangent`.
     """
 
     def __init__(
@@ -186,6 +186,7 @@ class Networks:
         self._hidden_gradients = [
             empty(rows, n) if keep or units is None or units.shape[2] != n else units for n, units in above
         ]  # fmt: skip
+        self._moved = [empty(rows, n) for n in shape.hidden] if keep else []
         self._scratch = [empty(*place.shape) for place in layout.weights]
         self.outputs = empty(shape.outputs, rows)
         self.output_gradients = empty(shape.outputs, rows)
@@ -212,7 +213,7 @@ class Networks:
         for layer, hidden in enumerate(self._hidden):
             weights = self._layout.weights[layer].of(directions)
             bias = self._layout.biases[layer].of(directions)[:, None, :]
-            moved = torch.baddbmm(bias, inputs, weights)
+            moved = torch.baddbmm(bias, inputs, weights, out=self._moved[layer])
             if found is not None:
                 moved.baddbmm_(found, self._weights[layer])
             found = self._through(moved, hidden)
@@ -264,12 +265,10 @@ class Samples:
     advantages: torch.Tensor
     returns: torch.Tensor
 
-    def of(self, dtype: torch.dtype) -> Samples:
-        """The same to compute with in `dtype`; SB3 scales advantages in float32, so they stay."""
-        actions = self.actions.to(dtype) if self.actions.is_floating_point() else self.actions
-        return Samples(
-            self.observations.to(dtype), actions, self.log_probs.to(dtype), self.advantages, self.returns.to(dtype)
-        )
+    def packed(self, dtype: torch.dtype) -> torch.Tensor:
+        """`(P, N, n)` all that belongs to a sample side by side, so that to gather it costs one visit to the memory."""
+        numbers = torch.stack([self.log_probs, self.returns, self.advantages], dim=2)
+        return torch.cat([self.observations, self.actions.float(), numbers], dim=2).to(dtype)
 
 
 @dataclass(frozen=True)
@@ -302,9 +301,9 @@ class Minibatches:
     log_ratios, losses, errors: what the minibatches gave, of each sample.  entropies: (count, P) means.
     """
 
-    def __init__(self, stack: Stack, samples: Samples, size: int, count: int, normalized: torch.Tensor) -> None:
+    def __init__(self, stack: Stack, packed: torch.Tensor, size: int, count: int, normalized: torch.Tensor) -> None:
         self.count, self.size, self.rows = count, size, rounded_up(size, ROWS)
-        self._stack, self._samples, self._normalized = stack, samples, normalized
+        self._stack, self._packed, self._normalized = stack, packed, normalized
         shape, device = stack.shape, stack.device
         each = (count, stack.members, self.rows)
 
@@ -315,27 +314,26 @@ class Minibatches:
         wide, kind = (1, torch.int64) if shape.discrete else (shape.outputs, stack.dtype)
         self.actions = empty(count, stack.members, wide, self.rows, dtype=kind)
         self.offsets, self.returns, self.pulls = empty(*each), empty(*each), empty(*each)
-        self._observations, self._actions = empty(*each, shape.inputs), empty(*each, wide, dtype=kind)
+        self._drawn = empty(*each, packed.shape[2])
+        self._observations, self._actions = self._drawn[..., : shape.inputs], self._drawn[..., shape.inputs : -3]
+        self._log_probs, self._returns, self._unscaled = self._drawn[..., -3:].unbind(3)
         self._advantages = empty(*each, dtype=torch.float32)
         self.log_ratios, self.losses, self.errors = empty(*each), empty(*each), empty(*each)
         self.entropies = empty(count, stack.members)
 
     def draw(self, places: NDArray[np.int64]) -> None:
         """Gather samples: (P, count * size) places in each member's."""
-        members, samples, size = self._stack.members, self._samples, self.size
+        members, size = self._stack.members, self.size
         index = np.zeros((self.count, members, self.rows), dtype=np.int64)
         index[:, :, :size] = places.reshape(members, self.count, size).swapaxes(0, 1)
-        index += np.arange(members)[:, None] * samples.returns.shape[1]
+        index += np.arange(members)[:, None] * self._packed.shape[1]
         which = torch.from_numpy(index.reshape(-1)).to(self._stack.device)
-        for source, target in (
-            (samples.observations, self._observations), (samples.actions, self._actions),
-            (samples.log_probs, self.offsets), (samples.returns, self.returns),
-            (samples.advantages, self._advantages),
-        ):  # fmt: skip
-            torch.index_select(source.flatten(0, 1), 0, which, out=target.flatten(0, 2))
+        torch.index_select(self._packed.flatten(0, 1), 0, which, out=self._drawn.flatten(0, 2))
         split(self.inputs, 1, (members, 2)).copy_(self._observations[:, :, None])
         self.actions.copy_(self._actions.transpose(2, 3))
-        self.offsets.neg_()
+        torch.neg(self._log_probs, out=self.offsets)
+        self.returns.copy_(self._returns)
+        self._advantages.copy_(self._unscaled)
         if size > 1:  # as SB3, and as there in float32
             mine = self._advantages[:, :, :size]
             exact = mine.double()  # to float32's last digit what torch.std says, in a sixth of its time
@@ -347,11 +345,11 @@ class Minibatches:
         self.pulls[:, :, size:] = 0.0
 
 
-def parts_of(stack: Stack, samples: Samples, size: int, normalized: torch.Tensor) -> list[Minibatches]:
+def parts_of(stack: Stack, packed: torch.Tensor, size: int, normalized: torch.Tensor) -> list[Minibatches]:
     """An epoch's minibatches: those of `size`, and the smaller one that is left, if any."""
-    whole, rest = divmod(samples.returns.shape[1], size)
+    whole, rest = divmod(packed.shape[1], size)
     kinds = ((size, whole), (rest, 1))
-    return [Minibatches(stack, samples, each, count, normalized) for each, count in kinds if each * count]
+    return [Minibatches(stack, packed, each, count, normalized) for each, count in kinds if each * count]
 
 
 class PPO:
@@ -370,7 +368,7 @@ class PPO:
         self._limits = column(stack, (1.5 * one.target_kl for one in settings))[:, 0]
         self._watched = any(math.isfinite(one.target_kl) for one in settings)
         normalized = column(stack, (float(one.normalize_advantage) for one in settings), torch.float32)
-        self._parts = parts_of(stack, samples.of(stack.dtype), batch_size, normalized)
+        self._parts = parts_of(stack, samples.packed(stack.dtype), batch_size, normalized)
         self._adam = Adam(stack, [one.learning_rate for one in settings])
 
     def run(self, orders: Iterable[NDArray[np.int64]]) -> list[Report]:
@@ -485,10 +483,12 @@ class Gaussian:
         self._means, self._gradients = means, gradients
         self._wide = stack.weights[:, ACTOR, :width]  # whole vectors
         self._log_std, self._log_std_gradient = place.of(stack.weights)[:, ACTOR], place.of(stack.gradient)[:, ACTOR]
+        self._exponential = torch.empty_like(self._wide, memory_format=torch.contiguous_format)
+        self._inverse = self._exponential[:, : self._dimensions, None]
 
     def log_prob(self, actions: torch.Tensor, offset: torch.Tensor, out: torch.Tensor) -> None:
         """`(P, n, rows), (P, rows) -> (P, rows)` log-probabilities plus `offset`, into `out`."""
-        self._inverse = torch.exp(-self._wide)[:, : self._dimensions, None]
+        torch.neg(self._wide, out=self._exponential).exp_()
         self._z = torch.sub(actions, self._means).mul_(self._inverse)
         self._total = self._log_std.sum(1, keepdim=True).add_(0.5 * LOG_2PI * self._dimensions)
         torch.sub(offset - self._total, self._z.square().sum(1), alpha=0.5, out=out)
@@ -506,7 +506,11 @@ class Gaussian:
 
     def remember(self) -> None:
         """Take the distribution of the last `log_prob` for the old one."""
-        self._old_means, self._old_inverse, self._old_wide = self._means.clone(), self._inverse, self._wide.clone()
+        self._old_means, self._old_inverse, self._old_wide = (
+            self._means.clone(),
+            self._inverse.clone(),
+            self._wide.clone(),
+        )
 
     def divergence(self, size: int) -> torch.Tensor:
         """`(P,)` means of KL(of the last `log_prob` || old) over samples and, as in sb3-contrib, action dimensions."""

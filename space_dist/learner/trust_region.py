@@ -65,8 +65,8 @@ class TRPO:
     ) -> None:
         self._stack, self._settings = stack, settings
         normalized = column(stack, (float(one.normalize_advantage) for one in settings), torch.float32)
-        samples = samples.of(stack.dtype)
-        self._all = Minibatches(stack, samples, samples.returns.shape[1], 1, normalized)
+        packed = samples.packed(stack.dtype)
+        self._all = Minibatches(stack, packed, packed.shape[1], 1, normalized)
         self._actors = Networks(stack, stack.weights[:, ACTOR], stack.gradient[:, ACTOR], self._all.rows, keep=True)
         self._inputs = split(self._all.inputs[0], 0, (stack.members, 2))[:, ACTOR]
         self._head = head_of(stack, self._actors.outputs, self._actors.output_gradients, self._all.size)
@@ -80,7 +80,7 @@ class TRPO:
                 last = first + place[0].numel()
                 place.copy_(noise[:, first:last].view(place.shape))
                 first = last
-        self._parts = parts_of(stack, samples, batch_size, normalized)
+        self._parts = parts_of(stack, packed, batch_size, normalized)
         self._critics = {
             part.rows: Networks(stack, stack.weights[:, CRITIC], stack.gradient[:, CRITIC], part.rows)
             for part in self._parts
