@@ -106,8 +106,12 @@ class PopulationLearner(OnPolicyLearner):
             if isinstance(self.settings, PPOConfig) or stack.layout.names[name][0] != ACTOR:  # TRPO's has no Adam
                 model.policy.optimizer.state[parameter] = {
                     "step": stack.steps[member].to("cpu", copy=True),
-                    "exp_avg": stack.parameter(stack.exp_avg, name)[member].cpu().clone(),
-                    "exp_avg_sq": stack.parameter(stack.exp_avg_sq, name)[member].cpu().clone(),
+                    "exp_avg": stack.parameter(stack.exp_avg, name)[member]
+                    .cpu()
+                    .clone(memory_format=torch.contiguous_format),
+                    "exp_avg_sq": stack.parameter(stack.exp_avg_sq, name)[member]
+                    .cpu()
+                    .clone(memory_format=torch.contiguous_format),
                 }
         model._n_updates += made.updates
         metrics = {
