@@ -19,8 +19,10 @@ RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
 
 
 def train(out: Path, learner: str, *arguments: str, seed: int = 0, workers: int = 0, resume: bool = False) -> list[str]:
-    settings = ["budget.steps=8192", "learner.n_steps=512", "evaluation.every_steps=4096", "tracking.uri=null"]
-    settings.append("checkpoint.every_rounds=1")
+    settings = [  # sixteen short rounds
+        "budget.steps=8192", "learner.n_steps=512", "rollout.slots=1", "evaluation.every_steps=4096",
+        "checkpoint.every_rounds=1", "tracking.uri=null",
+    ]  # fmt: skip
     if learner == "trpo":  # the shipped config is PPO's: what only PPO has goes
         settings.append(
             "learner={kind: trpo, n_steps: 512, gamma: 0.95, gae_lambda: 0.99, net_arch: [64, 64], target_kl: 0.004}"
