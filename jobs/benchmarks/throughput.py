@@ -114,7 +114,8 @@ def throughput(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "throughput.md").write_text(text)
-        _figure(table, out / "throughput.png")
+        if table:
+            _figure(table, out / "throughput.png")
     if json_file is not None:
         json_file.write_text(json.dumps(_numbers(table, ratios, projected), indent=1) + "\n")
     short = [name for name, ratio in ratios.items() if ratio < WANTED[name]]
