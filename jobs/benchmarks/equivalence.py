@@ -3,8 +3,8 @@
 Fixed before any run is looked at: the metric (mean undiscounted return over the held-out instances after the last
 update), the margin (a share of the pilot's mean), both error rates, and how the number of seeds follows from SB3's own
 spread between seeds: from the upper 90 % limit of the pilot's standard deviation (Browne 1995), since a pilot that
-happens to spread little would promise too much. The pilot's seeds are used for nothing else. SB3 against SB3 with other seeds is the control: what
-it does not pass, nobody could.
+happens to spread little would promise too much. The pilot's seeds are used for nothing else. SB3 against SB3 with other
+seeds is the control: what it does not pass, nobody could.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ def equivalence(
         seeds = needed(upper_limit(spread, len(pilot)), margin)
         console.print(
             f"pilot: SB3, {len(pilot)} seeds: mean {pilot.mean():.2f}, standard deviation {spread:.2f}, "
-            f"at most {upper_limit(spread, len(pilot)):.2f} ({CONFIDENCE:.0%}); margin {margin:.2f} ({MARGIN:.0%}); {POWER:.0%} power needs {seeds} seeds an arm", highlight=False,
+            f"at most {upper_limit(spread, len(pilot)):.2f} ({CONFIDENCE:.0%}); margin {margin:.2f} ({MARGIN:.0%}); "
+            f"{POWER:.0%} power needs {seeds} seeds an arm", highlight=False,
         )  # fmt: skip
         count = min(max(seeds, FEWEST), MOST)
         engines = {"sb3": "single", "population": "population", "control": "single"}
