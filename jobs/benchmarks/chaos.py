@@ -127,7 +127,7 @@ def plan(kinds: Sequence[str], count: int, steps: int, seed: int, last: float = 
 def chaos(
     faults: Annotated[int, typer.Option(min=1, help="Faults that must hit.")] = 50,
     runs: Annotated[int, typer.Option(min=1, help="Runs of the grid.")] = 8,
-    steps: Annotated[int, typer.Option(min=5_120, help="Environment steps of each run.")] = 122_880,
+    steps: Annotated[int, typer.Option(min=5_120, help="Environment steps of each run.")] = 184_320,
     seed: Annotated[int, typer.Option(min=0, help="Of kinds, moments and victims.")] = 0,
     kind: Annotated[Optional[list[str]], typer.Option(help="Only these kinds of faults; repeatable.")] = None,  # noqa: UP045
     population: Annotated[bool, typer.Option(help="Runs share their processes (engine: population).")] = False,
