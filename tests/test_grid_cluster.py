@@ -120,7 +120,7 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHe
 
 def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayHead, tmp_path: Path) -> None:
     work = start(cluster,
-        "grid", "work", tmp_path, "0" * 12, "--seed", 0, "--attempt", 1, "--nonce", "ab", "--job", "x"
+        "grid", "work", tmp_path, f"{'0' * 12}:0:1", "--nonce", "ab", "--job", "x"
     )  # fmt: skip
     said = work.communicate(timeout=60)[0]
     assert work.returncode == 1
