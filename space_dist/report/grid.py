@@ -372,7 +372,7 @@ def coupled_remarks(cells: Sequence[CellRuns]) -> list[str]:
     """Of cells whose runs train several policies under one curriculum: what a sample is, and whether there are few."""
     lines = []
     for cell in cells:
-        curriculum = cell.cell.config["curriculum"]
+        curriculum = cell.cell.config.get("curriculum", {})
         if curriculum.get("aggregate") == "population":
             finished = len(cell.configuration.finished)
             few = f" There are {finished}: an interval over fewer than {LEAST_POPULATIONS} says little."
