@@ -34,6 +34,7 @@ from typing import Any
 
 import psutil
 
+from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.manifest import Grid, Manifest, Run, RunResources
@@ -380,14 +381,6 @@ def _work(grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str, tel
 
     stop = StopRequests()
     stop.install()
-    if len(runs) == 1:
-        config, folder, failed = grid.run_config(manifest, runs[0], address=address), grid.ledger(runs[0]).folder, None
-        try:
-            launch(config, folder, resume=True, stop=stop)
-        except SpaceDistError as error:
-            failed = error
-        tell(runs[0], failed)
-        return
     from space_dist.population import advance, member
 
     by_folder = {grid.ledger(run).folder: run for run in runs}
@@ -395,11 +388,20 @@ def _work(grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str, tel
     def ended(folder: Path, outcome: Outcome | SpaceDistError) -> None:
         tell(by_folder[folder], outcome if isinstance(outcome, SpaceDistError) else None)
 
-    advance(
-        {folder: member(grid.run_config(manifest, run, address=address), folder, stop=stop)
-         for folder, run in by_folder.items()},
-        ended,
-    )  # fmt: skip
+    configured: dict[Path, RunConfig] = {}
+    for folder, run in by_folder.items():
+        try:
+            configured[folder] = grid.run_config(manifest, run, address=address)
+        except SpaceDistError as error:
+            ended(folder, error)
+    if len(runs) > 1:
+        advance({folder: member(config, folder, stop=stop) for folder, config in configured.items()}, ended)
+        return
+    for folder, config in configured.items():
+        try:
+            ended(folder, launch(config, folder, resume=True, stop=stop))
+        except SpaceDistError as error:
+            ended(folder, error)
 
 
 # ---- as a process of its own ----------------------------------------------------------------------------------------

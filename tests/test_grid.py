@@ -731,3 +731,19 @@ def test_a_population_that_is_killed_goes_on_with_every_member(supervised: Super
         for name in (METRICS, "curriculum.jsonl", "model.npz"):
             ours, other = (one.ledger(run).folder / name for one in (grid, unharmed.grid))
             assert ours.read_bytes() == other.read_bytes(), name
+
+
+@pytest.mark.parametrize("broken", [1, 2])
+def test_a_config_that_this_version_refuses_is_a_config_error_of_its_run(
+    broken: int, supervised: Supervised, tmp_path: Path
+) -> None:  # fmt: skip
+    """Alone, and beside a run that is none: a manifest may come from another version."""
+    settings = {**SMALL, "engine": "population"}
+    made = plan(write_grid(tmp_path, set=settings, seeds=[0], grid={"curriculum.kappa": [1, 4]}), tmp_path / "runs")
+    first, other = made.manifest.cells
+    wrong = dataclasses.replace(first, config={**first.config, "budget": {"steps": 1}})
+    made.grid.freeze(dataclasses.replace(made.manifest, cells=(wrong, other)), {})
+    runs = made.grid.manifest().runs()[:broken]
+    ends = supervised.attempts(made.grid, runs)
+    assert [end["cause"] for end in ends] == [Cause.CONFIG_ERROR, None][:broken]
+    assert "budget.steps" in ends[0]["detail"]
