@@ -343,7 +343,7 @@ class Training:
         """The update, and what the ensemble, if there is one, learned from the same shards."""
         if self.ensemble is None:
             return update
-        metrics = self.ensemble.update(shards, scales, round=self._run.round)
+        metrics = self.ensemble.update(shards, scales, round=shards[0].round)
         return dataclasses.replace(update, metrics={**update.metrics, **metrics})
 
     def _decide(self, policy: Handle) -> Work[None]:

@@ -16,6 +16,7 @@ from space_dist.errors import Interrupted
 from space_dist.instances import sample
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, private_ray
+from space_dist.learner import Ensemble
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from space_dist.report import draw_curriculum, load_run
 
@@ -187,3 +188,20 @@ def test_evaluation_is_on_the_instance_sets_of_everyone(reference: Any) -> None:
     assert set(lengths["spdrl"]) == set(lengths["uniform"]) == {3}
     first = [Ledger(reference(kind)).rows(METRICS)[0]["test"] for kind in ("spdrl", "uniform")]
     assert first[0] == first[1]  # before the first update nothing can differ
+
+
+def test_an_ensemble_is_fitted_under_the_number_of_the_round_that_it_learns_from(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its minibatches are drawn by it, like the learner's: another number would be another run."""
+    rounds: list[tuple[int, int]] = []
+    fit = Ensemble.update
+
+    def noted(self: Ensemble, shards: Any, statistics: Any, *, round: int) -> dict[str, float]:
+        rounds.append((round, shards[0].round))
+        return fit(self, shards, statistics, round=round)
+
+    monkeypatch.setattr(Ensemble, "update", noted)
+    launch(config("vds", folder), tmp_path / "run", resume=False, stop=StopRequests())
+    assert rounds == [(number, number) for number in range(len(rounds))]
+    assert len(rounds) > 1
