@@ -261,6 +261,20 @@ def test_two_pushers_take_turns(uri: str, tmp_path: Path, monkeypatch: pytest.Mo
     assert len(everything(uri)[1]) == 2
 
 
+def test_a_run_may_start_while_its_attempt_is_pushed(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, _ = make_grid(tmp_path / "demo", uri, etas=(0.1,))
+    begin(grid, 0, 0)
+    create = MlflowClient.create_run
+
+    def meanwhile(*args: Any, **keywords: Any) -> Any:
+        ledger_of(grid, 0, 0).config.write_text("half of what a run begins with")
+        return create(*args, **keywords)
+
+    monkeypatch.setattr(MlflowClient, "create_run", meanwhile)
+    result = sync([], grids=[grid])
+    assert (result.runs, result.created, result.rows, result.failed) == (1, 1, 0, {})
+
+
 def following(grid: Grid) -> tuple[threading.Thread, list[Any]]:
     results: list[Any] = []
     thread = threading.Thread(target=lambda: results.append(follow(grid.folder, poll_seconds=0.05)))

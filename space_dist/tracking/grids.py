@@ -227,7 +227,7 @@ class GridMirror:
         )  # fmt: skip
         config = {key: value for key, value in run.cell.config.items() if key != "instances"}
         note = f"**{run.cell.label}**, seed {run.seed}: nothing trained yet\n\n{part.remark}"
-        return Snapshot(ledger, status, look.running, {**config, "seed": run.seed}, (), (), note, part)
+        return Snapshot(ledger, status, look.running, {**config, "seed": run.seed}, (), (), note, part, started=False)
 
     def _part(self, manifest: Manifest, run: Run, grid_key: str, parent_id: str) -> Part:
         look, cell = self._looks[run.key], run.cell

@@ -89,7 +89,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What of a run is to be mirrored, read before MLflow is asked anything."""
+    """What of a run is to be mirrored, read before MLflow is asked anything.
+
+    started: whether its folder held a run then; of some attempts nothing is left but why they failed.
+    """
 
     ledger: Ledger
     status: Status
@@ -99,6 +102,7 @@ class Snapshot:
     timing: Sequence[Row]
     note: str  # Markdown: what the run is, where it stands, and how it did
     part: Part | None = None
+    started: bool = True
 
     @property
     def key(self) -> str:
@@ -307,7 +311,7 @@ class Store:
             self._push_params(run, snapshot)
             pushed = self._push_rows(run, snapshot)
             self._push_standing(run, snapshot)
-            if snapshot.ledger.exists():  # of some attempts nothing is left but why they failed
+            if snapshot.started:
                 self._push_artifacts(run, snapshot)
             if snapshot.part is not None and run.data.tags.get(STAMP_TAG) != snapshot.part.stamp:
                 self._client.set_tag(run.info.run_id, STAMP_TAG, snapshot.part.stamp)  # last: all else is there
