@@ -30,7 +30,7 @@ from space_dist.ledger import Lock
 from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, Run, label_of, load_grid
 from space_dist.provenance import code_digest, git_state, source_digest
 from space_dist.standing import Attempts, Ended, Standing, may_retry, standing_of, standings, unheard
-from space_dist.training import make_env, make_setup, resolved, stack_of, total_steps
+from space_dist.training import make_env, make_setup, memory_of, resolved, stack_of, total_steps
 
 log = logging.getLogger("space_dist")
 
@@ -39,6 +39,7 @@ _TICK_SECONDS = 0.2
 _ELSEWHERE_SECONDS = 2.0
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0
+_LIBRARIES_MB = 700  # of a process that trains, before it has a run
 MEMBERS = {"cpu": 32, "cuda": 1024}  # of a population, at most: more gain little, and are lost together
 
 
@@ -174,7 +175,7 @@ def _cell(
     data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
                              (("train", train), ("test", test))}  # fmt: skip
     steps = total_steps(config, make_env(config).horizon)
-    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config)), steps
+    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config), memory_of(config)), steps
 
 
 def _distinct(cells: Any) -> tuple[Cell, ...]:
@@ -210,6 +211,10 @@ class Executor(Protocol):
     @property
     def size(self) -> int:
         """How much room there is if nothing runs."""
+
+    @property
+    def memory_mb(self) -> float:
+        """What a process may use, in MB, if all places are taken; infinite if nobody knows."""
 
     def start(self, turns: Sequence[tuple[Run, int]]) -> None:
         """Begin attempts (runs, and which attempt of theirs), in one process that takes the room of one run.
@@ -322,9 +327,15 @@ class Conductor:
             return ready[:1]
         alike = [run for run in ready if run.cell.stack == ready[0].cell.stack]
         device = ready[0].cell.config["device"]
+        most = min(MEMBERS[device], self._fitting(max(run.cell.shared_mb for run in alike)))
         if device == "cuda":  # whose room no core's share of the runs would fill
-            return alike[: MEMBERS[device]]
-        return alike[: min(MEMBERS[device], -(-len(alike) // max(1, self._executor.size - self._places_taken())))]
+            return alike[:most]
+        return alike[: min(most, -(-len(alike) // max(1, self._executor.size - self._places_taken())))]
+
+    def _fitting(self, each_mb: int) -> int:
+        """How many runs of so much memory a process has room for, at least one."""
+        room = self._executor.memory_mb - _LIBRARIES_MB
+        return max(1, int(min(room / max(1, each_mb), sys.maxsize)))
 
     def _places_taken(self) -> int:
         return self._executor.size - self._executor.room() if self._live else 0

@@ -263,6 +263,7 @@ class Cell:
     id: 12 hex digits of the identity of its config. label: unique in the grid. settings: value by axis of the grid.
     config: a resolved run config as plain data, its instance paths relative to the grid's folder.
     stack: equal for cells whose runs can share a process (`engine: population`); empty for runs that work alone.
+    shared_mb: about what each of its runs takes of that process's memory, in MB.
     """
 
     id: str
@@ -270,6 +271,7 @@ class Cell:
     settings: Mapping[str, Any]
     config: Mapping[str, Any]
     stack: str = ""
+    shared_mb: int = 0
 
     @property
     def budget_steps(self) -> int:
@@ -358,7 +360,8 @@ class Manifest:
         data: dict[str, Any] = {
             "format": FORMAT, "name": self.name, "axes": list(self.axes),
             "cells": [{"id": cell.id, "label": cell.label, "settings": cell.settings, "config": cell.config,
-                       **({"stack": cell.stack} if cell.stack else {})} for cell in self.cells],
+                       **({"stack": cell.stack, "shared_mb": cell.shared_mb} if cell.stack else {})}
+                      for cell in self.cells],
             "seeds": list(self.seeds),
             "resources": self.resources.model_dump(), "retry": self.retry.model_dump(),
             "tracking": self.tracking.model_dump(),

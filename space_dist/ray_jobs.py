@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
+import math
 import os
 import shlex
 import shutil
@@ -68,9 +69,11 @@ def conduct(
         _await_nodes(nodes, stop_requested)
         size = _room_for(manifest, max_parallel)
         in_jobs = address != "local" and _as_jobs(grid, manifest, runs, mode)
-        pool_size = min(size, max(1, len(runs)))
+        pool_size, memory_mb = min(size, max(1, len(runs))), _memory_of_a_place(manifest, address)
         with (
-            Jobs(grid, manifest, size, dashboard) if in_jobs else Pool(grid, manifest, pool_size, stop_requested)
+            Jobs(grid, manifest, size, memory_mb, dashboard)
+            if in_jobs
+            else Pool(grid, manifest, pool_size, memory_mb, stop_requested)
         ) as executor:
             return Conductor(
                 grid, manifest, runs, executor, stop_requested=stop_requested, observe=observe
@@ -136,6 +139,17 @@ def _room_for(manifest: Manifest, max_parallel: int | None) -> int:
     return fits if max_parallel is None else min(fits, max_parallel)
 
 
+def _memory_of_a_place(manifest: Manifest, address: str) -> float:
+    """Of the CPUs that a run takes, in MB, on the node that has least of it for each CPU; infinite if none says."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    shares = [node.get("memory", math.inf) / node["CPU"] / 2**20 for node in nodes if node.get("CPU")]
+    if address == "local" and (given := os.environ.get("SLURM_MEM_PER_CPU", "")).isdecimal():
+        shares.append(float(given))  # SLURM may give us less than it lets us see
+    if address == "local" and (given := os.environ.get("SLURM_MEM_PER_NODE", "")).isdecimal():
+        shares.append(float(given) / _cores())
+    return min(shares, default=math.inf) * manifest.cpus_per_run
+
+
 def _as_jobs(grid: Grid, manifest: Manifest, runs: Sequence[Run], mode: Mode) -> bool:
     """Whether runs get a job each: on demand, or if they are expected to take long, by those that are done."""
     if mode != "auto":
@@ -153,8 +167,10 @@ def _as_jobs(grid: Grid, manifest: Manifest, runs: Sequence[Run], mode: Mode) ->
 class Jobs:
     """An `Executor` that gives each run a Ray job; admission is its own, so that no job waits inside Ray."""
 
-    def __init__(self, grid: Grid, manifest: Manifest, max_in_flight: int, dashboard: str) -> None:
-        self._grid, self._manifest, self._max = grid, manifest, max_in_flight
+    def __init__(
+        self, grid: Grid, manifest: Manifest, max_in_flight: int, memory_mb: float, dashboard: str
+    ) -> None:  # fmt: skip
+        self._grid, self._manifest, self._max, self.memory_mb = grid, manifest, max_in_flight, memory_mb
         self._nonce = Nonce(grid)
         context = ray.get_runtime_context()
         if not dashboard:

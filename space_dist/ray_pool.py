@@ -124,8 +124,10 @@ class Pool:
     `size` workers, of one CPU each, beside the CPUs of the runs' own rollout actors.
     """
 
-    def __init__(self, grid: Grid, manifest: Manifest, size: int, stop_requested: Callable[[], str | None]) -> None:
-        self._grid, self._manifest, self._size = grid, manifest, size
+    def __init__(
+        self, grid: Grid, manifest: Manifest, size: int, memory_mb: float, stop_requested: Callable[[], str | None]
+    ) -> None:
+        self._grid, self._manifest, self._size, self.memory_mb = grid, manifest, size, memory_mb
         self._stop_requested = stop_requested
         self._nonce = Nonce(grid)
         self._address = ray.get_runtime_context().gcs_address

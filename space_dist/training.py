@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
-from space_dist.config import RunConfig
+from space_dist.config import PPOConfig, RunConfig, TRPOConfig
 from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
@@ -50,6 +50,7 @@ from space_dist.learner import (
     Update,
     make_ensemble,
     make_learner,
+    member_bytes,
     refuse_population,
     refuse_spaces,
     stack_key,
@@ -717,6 +718,15 @@ def stack_of(config: RunConfig) -> str:
         stack_key(config.learner, env.observation_space, env.action_space),
     )
     return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+
+
+def memory_of(config: RunConfig) -> int:
+    """About what a run takes of the memory of the process that it shares, in MB; 0 for a run that works alone."""
+    if config.engine != "population" or not isinstance(config.learner, PPOConfig | TRPOConfig):
+        return 0
+    env = make_env(config)
+    each = member_bytes(config.learner, env.observation_space, env.action_space)
+    return -(-config.members * each >> 20)
 
 
 def learner_of(config: RunConfig) -> Learner | CoupledLearner:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import faulthandler
 import json
+import math
 import os
 import random
 import socket
@@ -498,8 +499,10 @@ def test_a_run_stops_when_its_supervisor_is_killed(tmp_path: Path) -> None:
 class Script:
     """An executor that ends runs as it is told to: a list of causes for each run."""
 
-    def __init__(self, grid: Grid, causes: dict[str, list[Cause | None]], size: int = 2) -> None:
-        self.grid, self.causes, self.size = grid, causes, size
+    def __init__(
+        self, grid: Grid, causes: dict[str, list[Cause | None]], size: int = 2, memory_mb: float = math.inf
+    ) -> None:
+        self.grid, self.causes, self.size, self.memory_mb = grid, causes, size, memory_mb
         self.live: list[Sequence[tuple[Run, int]]] = []
         self.started: list[str] = []
         self.groups: list[list[str]] = []
@@ -609,7 +612,7 @@ def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
     started: list[Run] = []
 
     class OneAtATime:
-        size = 1
+        size, memory_mb = 1, math.inf
 
         def __init__(self) -> None:
             self.now: Run | None = None
@@ -651,6 +654,18 @@ def test_runs_that_can_share_a_process_are_dealt_evenly_to_all_places(tmp_path: 
     Conductor(made.grid, made.manifest, made.manifest.runs(), script, stop_requested=lambda: None).conduct()
     assert [len(group) for group in script.groups] == [3, 3, 1]
     assert script.groups[2] == [made.manifest.runs()[0].key]
+
+
+@pytest.mark.parametrize(("members", "groups"), [(2.5, [2, 2, 2]), (0.0, [1] * 6), (100.0, [6])])
+def test_no_more_share_a_process_than_its_memory_holds(members: float, groups: list[int], tmp_path: Path) -> None:
+    path = write_grid(tmp_path, set={**SMALL, "engine": "population"}, seeds=[0, 1, 2])
+    made = plan(path, tmp_path / "runs")
+    manifest = made.grid.manifest()
+    (each,) = {cell.shared_mb for cell in manifest.cells}
+    assert each > 0
+    script = Script(made.grid, {}, size=1, memory_mb=700 + members * each)
+    Conductor(made.grid, manifest, manifest.runs(), script, stop_requested=lambda: None).conduct()
+    assert [len(group) for group in script.groups] == groups
 
 
 def test_only_what_is_alike_shares_a_process(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
 import shutil
@@ -15,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from space_dist.grid import plan
 from space_dist.launch import private_ray
 from space_dist.ledger import METRICS, this_process
 from space_dist.manifest import Grid, Run
@@ -138,6 +140,33 @@ def test_a_dead_job_server_is_one_clear_sentence(cluster: RayHead, tmp_path: Pat
     assert submit.returncode == 1
     assert "does not answer" in said
     assert "Traceback" not in said
+
+
+def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    private_ray()
+    import ray
+
+    from space_dist.ray_jobs import _memory_of_a_place
+
+    manifest = plan(write_grid(tmp_path, resources={"workers": 1}), tmp_path / "runs").manifest
+    gigabyte = 2.0**30
+    nodes = [{"Alive": True, "Resources": {"CPU": 8.0, "memory": 64 * gigabyte}},
+             {"Alive": True, "Resources": {"CPU": 8.0, "memory": 16 * gigabyte}},
+             {"Alive": True, "Resources": {"memory": gigabyte}},
+             {"Alive": False, "Resources": {"CPU": 8.0, "memory": gigabyte}}]  # fmt: skip
+    monkeypatch.setattr(ray, "nodes", lambda: nodes)
+    for name in ("SLURM_MEM_PER_CPU", "SLURM_MEM_PER_NODE"):
+        monkeypatch.delenv(name, raising=False)
+    assert _memory_of_a_place(manifest, "auto") == _memory_of_a_place(manifest, "local") == 4096.0
+    monkeypatch.setenv("SLURM_MEM_PER_CPU", "1000")
+    assert (_memory_of_a_place(manifest, "auto"), _memory_of_a_place(manifest, "local")) == (4096.0, 2000.0)
+    monkeypatch.setenv("SLURM_MEM_PER_NODE", "900")
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "1")
+    assert _memory_of_a_place(manifest, "local") == 1800.0
+    monkeypatch.setattr(ray, "nodes", list)
+    assert _memory_of_a_place(manifest, "auto") == math.inf
 
 
 def test_the_nonces_of_killed_conductors_go_with_the_next_ones(tmp_path: Path) -> None:

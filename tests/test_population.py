@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.cluster import make_curriculum
-from space_dist.config import RunConfig
+from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
@@ -22,7 +24,8 @@ from space_dist.ledger import Ledger
 from space_dist.policy import members_of
 from space_dist.population import advance, member
 from space_dist.rollout import Walk, Worker
-from space_dist.training import learner_of, make_setup
+from space_dist.training import learner_of, make_setup, memory_of
+from tests.grids import ROOT
 from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results
 from tests.tiny_env import Line
 
@@ -120,6 +123,27 @@ def test_whoever_is_lost_in_the_middle_goes_on_in_any_company(tmp_path: Path) ->
     assert [isinstance(end, Outcome) and end.already_done for end in ends.values()].count(True) == 1
     for number, config in enumerate(configs):
         assert results(folders[number]) == alone(config, tmp_path / f"alone{number}")
+
+
+@pytest.mark.parametrize("kind", ["ppo", "trpo"])
+def test_what_a_member_takes_of_the_memory_is_foreseen(kind: str, tmp_path: Path) -> None:
+    """Held against the memory of processes with few and with many members; what it takes at least, too."""
+    data = read_yaml(ROOT / "configs/pointmass_space.yaml")
+    once = {"ppo": "n_epochs", "trpo": "n_critic_updates"}[kind]
+    data |= {"engine": "population", "tracking": {"uri": None},
+             "budget": {"steps": 4096}, "evaluation": {"every_steps": 4096},
+             "learner": {"kind": kind, "n_steps": 4096, "batch_size": 512, "net_arch": [64, 64], once: 1},
+             "instances": {split: str(ROOT / f"configs/instances/pointmass_uniform_{split}.csv")
+                           for split in ("train", "test")}}  # fmt: skip
+    path = tmp_path / "config.yaml"
+    path.write_text(to_yaml(data))
+    peaks = []
+    for members in (4, 20):
+        command = [sys.executable, "-m", "tests.population_memory", path, str(members)]
+        said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        peaks.append(int(said.splitlines()[-1]))
+    each = (peaks[1] - peaks[0]) / 16 / 2**20
+    assert each <= memory_of(load(path)) <= 3 * each
 
 
 def test_a_member_that_is_asked_to_stop_stops_alone(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
-from space_dist.learner.population import PopulationLearner, learn_together, stack_key
+from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
 from space_dist.learner.population import refuse as refuse_population
 
 
@@ -106,6 +106,7 @@ __all__ = [
     "learn_together",
     "make_ensemble",
     "make_learner",
+    "member_bytes",
     "preload",
     "refuse_device",
     "refuse_population",

@@ -23,10 +23,17 @@ from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
 from space_dist.learner.on_policy import Joined, OnPolicyLearner, mean_sizes
-from space_dist.learner.stacked import ACTOR, PPO, ROWS, PPOSettings, Report, Samples, Shape, Stack, rounded_up
+from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Shape, Stack, rounded_up
 from space_dist.learner.trust_region import TRPO, TRPOSettings
 from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
+
+# What a member takes, measured (tests/test_population.py holds it against the memory of a process).
+_ROLLOUT_COPIES, _PER_STEP = 10, 8  # numbers beside observation and action: reward, value, advantage, ...
+_TRPO_KEPT, _PPO_KEPT = 5, 6  # times the units of all layers
+_PARAMETER_COPIES = 10
+_OBJECTS_BYTES = 1 << 20
+_NUMBER_BYTES = 4
 
 Array = NDArray[np.float32]
 Floats = NDArray[np.floating[Any]]
@@ -152,6 +159,22 @@ def stack_key(config: LearnerConfig, observation_space: spaces.Space[Any], actio
         raise TypeError(config)
     shape = _shape(config, observation_space, action_space)
     return (config.kind, shape, config.n_steps, config.batch_size, _passes(config))
+
+
+def member_bytes(
+    config: PPOConfig | TRPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> int:
+    """About what a member takes of its process's memory while it learns, no less: rollouts, activations, networks."""
+    shape = _shape(config, observation_space, action_space)
+    parameters = 2 * Layout(shape).length
+    # TRPO's products with the Hessian go over the whole rollout at once, and need all that the actor has computed.
+    samples, kept = (config.n_steps, _TRPO_KEPT) if isinstance(config, TRPOConfig) else (config.batch_size, _PPO_KEPT)
+    numbers = (
+        config.n_steps * _ROLLOUT_COPIES * (shape.inputs + shape.outputs + _PER_STEP)
+        + samples * kept * sum(shape.sizes)
+        + parameters * _PARAMETER_COPIES
+    )
+    return _OBJECTS_BYTES + _NUMBER_BYTES * numbers
 
 
 def _passes(config: PPOConfig | TRPOConfig) -> int:
