@@ -52,7 +52,9 @@ def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
 
 
 @pytest.mark.ray
-@pytest.mark.parametrize("workers", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("reference", "workers"), [("ppo", 1), ("ppo", 2), ("ppo", 4), ("trpo", 4)], indirect=["reference"]
+)
 def test_the_number_of_workers_changes_no_byte(reference: tuple[str, Path], workers: int, tmp_path: Path) -> None:
     learner, folder = reference
     run(train(tmp_path / "run", learner, workers=workers))
