@@ -13,6 +13,8 @@ import dataclasses
 import fcntl
 import hashlib
 import logging
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -39,6 +41,7 @@ _TICK_SECONDS = 0.2
 _ELSEWHERE_SECONDS = 2.0
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0
+_ABANDONED_SECONDS = 5.0  # after the grace time of a run whose supervisor is gone
 _LIBRARIES_MB = 700  # of a process that trains, before it has a run
 MEMBERS = {"cpu": 32, "cuda": 1024}  # of a population, at most: more gain little, and are lost together
 
@@ -260,6 +263,7 @@ class Conductor:
         self._live: dict[str, Run] = {}
         self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
+        self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
         self._overview = Overview(len(runs))
 
     def conduct(self) -> list[Standing]:
@@ -276,6 +280,7 @@ class Conductor:
                 looked = time.monotonic()
                 for run in list(self._elsewhere.values()):
                     self._place(run)
+                    self._end_if_abandoned(run)
             self._show()
             time.sleep(_TICK_SECONDS)
         self._show()
@@ -308,6 +313,18 @@ class Conductor:
             log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
         else:
             self._overview.done += 1
+
+    def _end_if_abandoned(self, run: Run) -> None:
+        """A run whose supervisor was killed hears of it and ends, unless it is stopped (SIGSTOP) or hangs."""
+        history = Attempts(self._grid.ledger(run)).history()
+        if run.key not in self._elsewhere or not history.abandoned:
+            self._abandoned.pop(run.key, None)
+            return
+        late = time.monotonic() - self._abandoned.setdefault(run.key, time.monotonic())
+        if late > self._manifest.resources.grace_seconds + _ABANDONED_SECONDS:
+            log.warning("%s: its supervisor is gone, and it does not end: killing it", run.title)
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(history.process["pid"], signal.SIGKILL)  # a session of its own
 
     def _start_what_fits(self) -> None:
         for _ in range(self._executor.room()):

@@ -634,6 +634,11 @@ def _refuse(folder: Path, error: OSError) -> NoReturn:
 
 def this_process() -> dict[str, Any]:
     """Who we are, so that anyone can tell whether we still live: host, boot, namespace, pid, and when it started."""
+    return process_of(os.getpid())
+
+
+def process_of(pid: int) -> dict[str, Any]:
+    """The same of another process of our namespace."""
 
     def read(path: str) -> str:
         try:
@@ -649,8 +654,8 @@ def this_process() -> dict[str, Any]:
         "host": socket.gethostname(),
         "boot_id": read("/proc/sys/kernel/random/boot_id"),
         "pid_namespace": pid_namespace,
-        "pid": os.getpid(),
-        "started": _started(os.getpid()),
+        "pid": pid,
+        "started": _started(pid),
     }
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from space_dist.errors import LedgerError
-from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, this_process
+from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, process_of, this_process
 from space_dist.manifest import Grid, Manifest, Retry, Run
 
 ATTEMPTS = "attempts.jsonl"
@@ -68,13 +68,20 @@ class History:
     """The attempts of a run.
 
     begun: how many began. last: how the last one ended; None if it has not, as far as is known.
-    ends: how often each cause ended one, since a user last asked for another try. where: of the last attempt.
+    ends: how often each cause ended one, since a user last asked for another try. where: of the last attempt, with its
+    supervisor. process: that its supervisor has started for it; empty if that is not known.
     """
 
     begun: int = 0
     last: Ended | None = None
     ends: Mapping[Cause, int] = field(default_factory=dict)
     where: Mapping[str, Any] = field(default_factory=dict)
+    process: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether its process lives here, and the supervisor does not that would end it."""
+        return believed_alive(self.process) and not believed_alive(self.where)
 
 
 class Attempts:
@@ -86,6 +93,10 @@ class Attempts:
     def begin(self, attempt: int, where: Mapping[str, Any]) -> None:
         """Attempt number `attempt` (from 1) begins in this process; `where` adds to what is known of it (a job)."""
         self._append({"event": "begin", "attempt": attempt, "where": {**this_process(), **where}})
+
+    def started(self, pid: int) -> None:
+        """The attempt that began last is made by another process of this namespace."""
+        self._append({"event": "process", "process": process_of(pid)})
 
     def end(self, attempt: int, ended: Ended) -> None:
         """It has ended."""
@@ -135,22 +146,24 @@ class Attempts:
 
     def history(self) -> History:
         """What the rows say."""
-        begun, last, where = 0, None, dict[str, Any]()
+        begun, last, where, process = 0, None, dict[str, Any](), dict[str, Any]()
         ends: Counter[Cause] = Counter()
         for row in self.rows():
             with contextlib.suppress(KeyError, ValueError, TypeError):  # rows of a later version
                 if row["event"] == "begin":
-                    begun, last = max(begun, int(row["attempt"])), None
+                    begun, last, process = max(begun, int(row["attempt"])), None, {}
                     where = {**row["where"], "heartbeat": max(row["unix_time"], self.last_sign())}
                 elif row["event"] == "end":
                     begun = max(begun, int(row["attempt"]))
                     last = Ended(None if row["cause"] is None else Cause(row["cause"]), str(row["detail"]))
                     if last.cause is not None:
                         ends[last.cause] += 1
+                elif row["event"] == "process":
+                    process = dict(row["process"])
                 elif row["event"] == "retry":
                     ends.clear()
                     last = Ended(None)
-        return History(begun, last, ends, where)
+        return History(begun, last, ends, where, process)
 
 
 def slurm_job() -> dict[str, Any]:

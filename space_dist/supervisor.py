@@ -123,7 +123,10 @@ class Supervisor:
         out_of_memory_before = _system_kills()
         output = grid.ledger(runs[0]).folder / OUTPUT
         child = _Child.fork(lambda tell: _work(grid, manifest, runs, address, tell), output)
-        watch = _Watch(child, manifest.resources, [Attempts(grid.ledger(run)) for run in runs])
+        histories = [Attempts(grid.ledger(run)) for run in runs]
+        for history in histories:
+            history.started(child.pid)
+        watch = _Watch(child, manifest.resources, histories)
         while (code := child.code()) is None:
             watch.look(stop_requested)
             time.sleep(_LOOK_SECONDS)

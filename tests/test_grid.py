@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from space_dist import config as configs
@@ -534,6 +535,33 @@ class Script:
 
     def adopt(self, runs: Any) -> list[Run]:  # noqa: ARG002
         return []
+
+
+def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody is left to end it but whoever waits for it; and what is merely slow to end is left in peace."""
+    grid, manifest, run = faulty(tmp_path, "stop", resources={"grace_seconds": 0.5})
+    lonely, deadline = Supervised(), time.monotonic() + 30
+    lonely.send(task(grid, [run]))
+    stopped, attempts = None, Attempts(grid.ledger(run))
+    while stopped is None or stopped.status() != psutil.STATUS_STOPPED:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+        stopped = psutil.Process(attempts.history().process["pid"]) if attempts.history().process else None
+    assert not attempts.history().abandoned
+    lonely.process.kill()
+    lonely.process.wait()
+    assert attempts.history().abandoned
+    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "running"
+    monkeypatch.setattr("space_dist.grid._ABANDONED_SECONDS", 0.5)
+    monkeypatch.setattr("space_dist.grid._ELSEWHERE_SECONDS", 0.1)
+    script, began = Script(grid, {}), time.monotonic()
+    Conductor(grid, manifest, [run], script, stop_requested=lambda: None).conduct()
+    assert script.started == [run.key]
+    assert time.monotonic() - began > 1.0
+    assert not stopped.is_running() or stopped.status() == psutil.STATUS_ZOMBIE
+    assert not attempts.history().abandoned
 
 
 def test_the_conductor_retries_by_cause_and_never_starts_more_than_fits(tmp_path: Path) -> None:
