@@ -311,7 +311,11 @@ class Conductor:
         elif standing.condition == "failed":
             self._overview.failed += 1
             log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
+        elif not standing.told and standing.supervised:
+            self._elsewhere[run.key] = run
         else:
+            if not standing.told:  # its supervisor died in between
+                Attempts(standing.ledger).end(standing.attempts, Ended(None))
             self._overview.done += 1
 
     def _end_if_abandoned(self, run: Run) -> None:

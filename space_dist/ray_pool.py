@@ -220,8 +220,13 @@ class Pool:
         """Those that are done are done; nobody but us can say how the others ended."""
         ended: list[tuple[Run, Ended | None]] = []
         for run, attempt in turns:
+            attempts = Attempts(self._grid.ledger(run))
+            history = attempts.history()
+            if history.begun >= attempt and history.last is not None:  # its supervisor has still said so
+                ended.append((run, history.last))
+                continue
             done = Ended(None) if is_done(self._grid.ledger(run)) else lost
-            Attempts(self._grid.ledger(run)).end(attempt, done)
+            attempts.end(attempt, done)
             ended.append((run, done))
         return ended
 

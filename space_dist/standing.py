@@ -190,7 +190,8 @@ class Standing:
     condition: `waiting` runs will be started, or go on, when somebody works on the grid; `failed` ones will not.
     cause, detail: of the last attempt's end, if it has not been done since.
     steps, budget_steps: environment steps. attempts: how many began. other_code: done, but by another version of this
-    package than the one here. started_at: of the running attempt, seconds since the epoch.
+    package than the one here. told, supervised: of a run that is done, whether the end of its last attempt is written,
+    and whether its supervisor lives that would write it.
     """
 
     run: Run
@@ -203,6 +204,8 @@ class Standing:
     detail: str = ""
     other_code: bool = False
     fingerprint_changed: bool = False
+    told: bool = True
+    supervised: bool = False
 
     @property
     def in_words(self) -> str:
@@ -225,6 +228,7 @@ def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
         return Standing(
             run, ledger, "done", steps, budget, history.begun,
             other_code=status.fingerprint.get("code") != code, fingerprint_changed=status.fingerprint_changed,
+            told=history.last is not None or not history.begun, supervised=believed_alive(history.where),
         )  # fmt: skip
     if status is not None and ledger.owner_alive():
         return Standing(run, ledger, "running", steps, budget, history.begun)

@@ -52,9 +52,7 @@ def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
 
 
 @pytest.mark.ray
-@pytest.mark.parametrize(
-    ("reference", "workers"), [("ppo", 1), ("ppo", 2), ("ppo", 4), ("trpo", 4)], indirect=["reference"]
-)
+@pytest.mark.parametrize("workers", [1, 2, 4])
 def test_the_number_of_workers_changes_no_byte(reference: tuple[str, Path], workers: int, tmp_path: Path) -> None:
     learner, folder = reference
     run(train(tmp_path / "run", learner, workers=workers))

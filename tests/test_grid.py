@@ -21,7 +21,7 @@ import pytest
 
 from space_dist import config as configs
 from space_dist import supervisor
-from space_dist.errors import ConfigError, LedgerError
+from space_dist.errors import ConfigError, Interrupted, LedgerError
 from space_dist.grid import Conductor, plan
 from space_dist.ledger import METRICS, Lock, Row
 from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
@@ -562,6 +562,38 @@ def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
     assert time.monotonic() - began > 1.0
     assert not stopped.is_running() or stopped.status() == psutil.STATUS_ZOMBIE
     assert not attempts.history().abandoned
+
+
+def test_a_done_run_whose_supervisor_died_before_it_said_so_has_its_end_written_once(
+    supervised: Supervised, tmp_path: Path
+) -> None:  # fmt: skip
+    grid, manifest, run = faulty(tmp_path, "none")
+    assert supervised.attempt(grid, run)["cause"] is None
+    attempts = Attempts(grid.ledger(run))
+    begin, process, _ = attempts.path.read_bytes().splitlines(keepends=True)
+    attempts.path.write_bytes(begin + process)
+    assert not standing_of(run, grid.ledger(run), manifest.retry, CODE).told
+
+    def conduct() -> Script:
+        script = Script(grid, {})
+        Conductor(grid, manifest, [run], script, stop_requested=stop).conduct()
+        return script
+
+    def stop() -> str | None:  # asked each time round
+        return "still supervised" if time.monotonic() > until else None
+
+    until = time.monotonic() + 0.5
+    with pytest.raises(Interrupted):
+        conduct()
+    assert attempts.history().last is None
+    dead = {**attempts.rows()[0]["where"], "started": 1}
+    attempts.path.write_bytes(b"")
+    attempts._append({"event": "begin", "attempt": 1, "where": dead})
+    until = math.inf
+    for _ in range(2):
+        assert conduct().started == []
+        assert [row["event"] for row in attempts.rows()] == ["begin", "end"]
+    assert attempts.history().last == Ended(None)
 
 
 def test_the_conductor_retries_by_cause_and_never_starts_more_than_fits(tmp_path: Path) -> None:
