@@ -33,7 +33,7 @@ from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
-from space_dist.standing import Attempts, Cause, Ended, Standing
+from space_dist.standing import Attempts, Cause, Ended, Standing, is_done
 from space_dist.supervisor import Turn, ray_answers
 
 log = logging.getLogger("space_dist")
@@ -267,6 +267,9 @@ class Jobs:
         history = attempts.history()
         if history.begun >= attempt and history.last is not None:
             return history.last
+        if is_done(self._grid.ledger(run)) and history.begun >= attempt:
+            attempts.end(attempt, Ended(None))  # its supervisor was killed before it could
+            return Ended(None)
         if details is not None and details.status == JobStatus.SUCCEEDED:
             return None  # somebody else is working on the run
         message = (details.message if details is not None else None) or "its job is gone"
