@@ -26,6 +26,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_DEDUP_LOGS", "0")
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
+import psutil
 import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.placement_group import PlacementGroup, placement_group, placement_group_table, remove_placement_group
@@ -38,6 +39,7 @@ from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
+_STARTS = 3  # of a Ray of our own
 _ATTEMPTS = 6  # at one call, or at one actor's start, before something must be wrong with the work itself
 _LOOK_SECONDS = 0.2  # between two looks for what died or is late
 _RESCHEDULING_SECONDS = 5.0  # that Ray gets to find other room for a lost node's actors
@@ -137,21 +139,8 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        try:
-            if resources.address == "local":
-                self._session = ray.init(
-                    address="local", num_cpus=resources.workers + 1, include_dashboard=False, log_to_driver=False,
-                    logging_level=logging.ERROR, object_store_memory=_OBJECT_STORE_BYTES, configure_logging=False,
-                ).address_info["session_dir"]  # type: ignore[attr-defined]  # fmt: skip
-            else:
-                ray.init(
-                    address=resources.address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
-                )  # fmt: skip
-        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-            raise SpaceDistError(
-                f"Ray cannot be started or reached at resources.address = {resources.address!r}: "
-                f"{str(error).splitlines()[0] if str(error) else type(error).__name__}"
-            ) from error
+        found = join_ray(resources.address, resources.workers + 1)
+        self._session = found["session_dir"] if resources.address == "local" else None
         try:
             self._setup_piece = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
@@ -448,6 +437,38 @@ class RayCluster:
             f"(resources.room_seconds) none was found; the cluster has {total:.0f} CPUs, {free:.0f} of them free. "
             "Fewer fit with --workers"
         )
+
+
+def join_ray(address: str, cpus: int) -> dict[str, Any]:
+    """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
+
+    A start that fails is tried again: Ray gives its processes 30 s, in which a busy machine may not come to them.
+    Raises SpaceDistError if Ray cannot be started or reached.
+    """
+    ours = address == "local"
+    options: dict[str, Any] = (
+        {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES} if ours else {}
+    )
+    failures = 0
+    while True:
+        before = set(psutil.Process().children())
+        try:
+            context = ray.init(
+                address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False, **options
+            )
+        except Exception as error:  # Ray raises bare ones, too
+            failures += 1
+            what = _first_line(error)
+            if not ours or failures == _STARTS:
+                raise SpaceDistError(f"Ray cannot be started or reached at {address!r}: {what}") from error
+            log.warning("Ray did not start (%s); trying again", what)
+            ray.shutdown()
+            for process in set(psutil.Process().children()) - before:  # halves of a Ray
+                with contextlib.suppress(psutil.Error):
+                    process.kill()
+        else:
+            found: dict[str, Any] = context.address_info  # type: ignore[attr-defined]
+            return found
 
 
 def remove_session(folder: str | None) -> None:

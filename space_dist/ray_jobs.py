@@ -28,7 +28,7 @@ import ray
 import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
-from space_dist.distributed import remove_session
+from space_dist.distributed import join_ray, remove_session
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
@@ -41,7 +41,6 @@ log = logging.getLogger("space_dist")
 Mode = Literal["auto", "pool", "jobs"]
 LONG_SECONDS = 300.0  # runs expected to take longer get a job each
 STEPS_PER_SECOND = 4_000.0  # of a run whose speed nobody has measured yet: PPO on PointMass, one core
-_OBJECT_STORE_BYTES = 256 << 20
 _POLL_SECONDS = 1.0
 _NODES_SECONDS = 180.0
 _AGENT_SECONDS = 60.0
@@ -83,30 +82,14 @@ def conduct(
 @contextlib.contextmanager
 def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Iterator[str]:
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
-    own = None
+    # A run with rollout actors may have more processes than this machine has cores; they share them.
+    context = join_ray(address, max(_cores(), (max_parallel or 1) * manifest.cpus_per_run))
     try:
-        if address == "local":
-            cores = _cores()
-            # A run with rollout actors may have more processes than this machine has cores; they share them.
-            cpus = max(cores, (max_parallel or 1) * manifest.cpus_per_run)
-            context = ray.init(
-                address="local", num_cpus=cpus, include_dashboard=False, log_to_driver=False,
-                logging_level=logging.ERROR, configure_logging=False, object_store_memory=_OBJECT_STORE_BYTES,
-            )  # fmt: skip
-            own = context.address_info["session_dir"]  # type: ignore[attr-defined]
-        else:
-            context = ray.init(
-                address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False
-            )  # fmt: skip
-    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SpaceDistError(f"Ray cannot be started or reached at {address!r}: {first}") from error
-    try:
-        yield context.address_info.get("webui_url") or ""  # type: ignore[attr-defined]
+        yield context.get("webui_url") or ""
     finally:
-        if ray_answers(context.address_info["gcs_address"]):  # type: ignore[attr-defined]
+        if ray_answers(context["gcs_address"]):
             ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
-            remove_session(own)
+            remove_session(context["session_dir"] if address == "local" else None)
 
 
 def _cores() -> int:

@@ -75,15 +75,17 @@ def test_killed_five_times_and_resumed_it_is_the_same(reference: tuple[str, Path
     moments = random.Random(f"kills of {learner}")
     for kill, target in enumerate(sorted(moments.sample(range(1, 10), 5))):
         # The last kills hit runs that have Ray actors, which must not outlive their driver.
-        process = subprocess.Popen(
-            train(out, learner, workers=2 if kill >= 3 else 0, resume=True),
-            cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
+        with (tmp_path / f"said-{kill}.txt").open("w") as said:
+            process = subprocess.Popen(
+                train(out, learner, workers=2 if kill >= 3 else 0, resume=True),
+                cwd=ROOT, stdout=said, stderr=said, start_new_session=True,
+            )  # fmt: skip
         deadline = time.monotonic() + 120
         while _round(out) < target and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.002)
         time.sleep(moments.uniform(0.0, 0.1))
-        assert process.poll() is None, "the run ended before it could be killed"
+        ended = f"the run ended before it could be killed, in round {_round(out)} of {target}"
+        assert process.poll() is None, f"{ended}: {(tmp_path / f'said-{kill}.txt').read_text()}"
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
     assert Ledger(out).status().state == "running"  # nobody was left to say otherwise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -105,6 +107,49 @@ def test_an_actor_that_cannot_be_placed_is_an_error(cluster_class: Any, monkeypa
     with pytest.raises(SpaceDistError, match=said), cluster_class(run, _setup(run)):
         pass
     assert not ray.is_initialized()
+
+
+@pytest.mark.usefixtures("cluster_class")
+def test_a_ray_that_does_not_start_in_time_is_started_again(
+    reference: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import ray
+
+    started, halves = ray.init, []
+
+    def on_a_busy_machine(**options: Any) -> Any:
+        if len(halves) < 2:  # what it has started by then goes on
+            halves.append(subprocess.Popen(["/bin/sleep", "600"]))
+            raise Exception("The current node timed out during startup.\nThis could happen because")
+        return started(**options)
+
+    monkeypatch.setattr(ray, "init", on_a_busy_machine)
+    launch(config(1), tmp_path, resume=True, stop=StopRequests())
+    assert results(tmp_path) == reference
+    assert [half.wait(timeout=60) for half in halves] == [-signal.SIGKILL] * 2
+    log = (tmp_path / "log.txt").read_text()
+    assert log.count("Ray did not start (The current node timed out during startup.); trying again") == 2
+
+
+def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import ray
+
+    from space_dist.errors import SpaceDistError
+
+    begun = []
+
+    def never(**options: Any) -> Any:
+        begun.append(options["address"])
+        raise Exception("The current node timed out during startup.\nThis could happen because")
+
+    monkeypatch.setattr(ray, "init", never)
+    for address, starts in (("local", 3), ("127.0.0.1:1", 1)):  # somebody else's is not ours to start
+        run = config(1, f"resources.address={address}")
+        said = f"^Ray cannot be started or reached at '{address}': The current node timed out during startup.$"
+        with pytest.raises(SpaceDistError, match=said), cluster_class(run, _setup(run)):
+            pass
+        assert begun == [address] * starts
+        begun.clear()
 
 
 def _setup(run: configs.RunConfig) -> Any:
