@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from space_dist.envs import BatchedEnv, ContextObservation, bullet, make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import DISTRIBUTIONS, read_csv, refuse_overlap, sample
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parent.parent
 ENVS = {"space_dist/AntGoal-v0": "antgoal_all", "space_dist/BallCatching-v0": "ballcatching_uniform"}
@@ -136,7 +137,7 @@ def test_another_process_gives_the_same_bits(alone: dict[str, dict[Job, str]]) -
         "    for digest in run(make_batched(env_id, 2, context_visible=False), jobs(env_id, 12)).items():\n"
         "        print(env_id, digest[0].seed, digest[1])\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert (done.returncode, done.stderr) == (0, "")  # nothing at the interpreter's exit, and no greeting of PyBullet's
     expected = {(env_id, str(job.seed), digest) for env_id, told in alone.items() for job, digest in told.items()}
     assert {tuple(line.split()) for line in done.stdout.splitlines()} == expected

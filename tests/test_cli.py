@@ -18,6 +18,7 @@ from space_dist import cli
 from space_dist.cli import runs
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "configs/pointmass_space.yaml"
@@ -161,7 +162,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small run, left alone."""
     folder = tmp_path_factory.mktemp("finished") / "run"
     command = [sys.executable, "-m", "space_dist.cli", *map(str, train(out=folder))]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert len(done.stdout.splitlines()) == 1  # quiet when not a terminal
@@ -196,14 +197,14 @@ def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "space_dist.cli", *map(str, train(out=folder))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
         time.sleep(0.005)
     if isinstance(how, signal.Signals):
         process.send_signal(how)
     else:
         (folder / "stop").touch()
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=PATIENCE)
     status = Ledger(folder).status()
     assert (process.returncode, status.state) == (75, "interrupted"), error
     assert 0 < status.steps < 8192
@@ -218,7 +219,7 @@ def test_a_second_process_on_the_same_run_refuses(capsys: pytest.CaptureFixture[
     command = [sys.executable, "-m", "space_dist.cli", *map(str, train("budget.steps=10000000", out=folder))]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
         try:
-            deadline = time.monotonic() + 60
+            deadline = time.monotonic() + PATIENCE
             while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
                 time.sleep(0.01)
             code, _, error = run(capsys, *train("budget.steps=10000000", out=folder), "--resume")
@@ -234,14 +235,14 @@ def test_a_round_longer_than_the_grace_time_ends_on_the_last_checkpoint(finished
     settings = ("resources.grace_seconds=0.3",)
     command = [sys.executable, "-m", "space_dist.cli", *map(str, train(*settings, out=folder))]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
         time.sleep(0.005)
     process.send_signal(signal.SIGSTOP)  # as if the round took for ever
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGCONT)
-    assert process.wait(timeout=60) == 75
-    done = subprocess.run([*command, "--resume"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert process.wait(timeout=PATIENCE) == 75
+    done = subprocess.run([*command, "--resume"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert same(folder, finished)
 
@@ -309,7 +310,7 @@ def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixt
 def test_a_dead_tracking_server_costs_a_warning_and_nothing_else(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "space_dist.cli", *map(str, train("tracking.uri=http://127.0.0.1:9", out=folder))]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0
     assert "warning: MLflow at http://127.0.0.1:9 could not be brought up to date" in done.stderr
     assert same(folder, finished)

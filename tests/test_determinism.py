@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
@@ -35,7 +36,7 @@ def train(out: Path, learner: str, *arguments: str, seed: int = 0, workers: int 
 
 
 def run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=250)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
 
 
@@ -80,7 +81,7 @@ def test_killed_five_times_and_resumed_it_is_the_same(reference: tuple[str, Path
                 train(out, learner, workers=2 if kill >= 3 else 0, resume=True),
                 cwd=ROOT, stdout=said, stderr=said, start_new_session=True,
             )  # fmt: skip
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + PATIENCE
         while _round(out) < target and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.002)
         time.sleep(moments.uniform(0.0, 0.1))

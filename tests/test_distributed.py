@@ -17,6 +17,7 @@ from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, private_ray, read_instances
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from space_dist.training import learner_of, make_setup
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
@@ -126,7 +127,7 @@ def test_a_ray_that_does_not_start_in_time_is_started_again(
     monkeypatch.setattr(ray, "init", on_a_busy_machine)
     launch(config(1), tmp_path, resume=True, stop=StopRequests())
     assert results(tmp_path) == reference
-    assert [half.wait(timeout=60) for half in halves] == [-signal.SIGKILL] * 2
+    assert [half.wait(timeout=PATIENCE) for half in halves] == [-signal.SIGKILL] * 2
     log = (tmp_path / "log.txt").read_text()
     assert log.count("Ray did not start (The current node timed out during startup.); trying again") == 2
 
@@ -161,7 +162,7 @@ def test_a_stop_request_ends_a_run_on_ray_with_a_checkpoint(reference: dict[str,
     from space_dist.errors import Interrupted
 
     def stop_soon() -> None:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE
         while not (tmp_path / METRICS).exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         (tmp_path / "stop").touch()

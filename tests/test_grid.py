@@ -28,6 +28,7 @@ from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
 from space_dist.provenance import source_digest
 from space_dist.standing import Attempts, Cause, Ended, exit_code, last_lines, standing_of, standings
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
+from tests.patience import PATIENCE
 from tests.test_report import continue_run, start_run
 
 CODE = "0" * 16
@@ -408,7 +409,7 @@ def supervised() -> Any:
     yield made
     assert made.process.stdin is not None
     made.process.stdin.close()
-    assert made.process.wait(timeout=30) == 0
+    assert made.process.wait(timeout=PATIENCE) == 0
 
 
 def faulty(folder: Path, fault: str, marker: str = "", **sections: Any) -> tuple[Grid, Manifest, Run]:
@@ -482,13 +483,13 @@ def test_a_run_stops_when_its_supervisor_is_killed(tmp_path: Path) -> None:
     grid, manifest, run = faulty(tmp_path, "slow")
     lonely = Supervised()
     lonely.send(task(grid, [run]))
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE
     while not grid.ledger(run).owner_alive() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert grid.ledger(run).owner_alive()
     lonely.process.kill()
     lonely.process.wait()
-    while grid.ledger(run).owner_alive() and time.monotonic() < deadline + 40:
+    while grid.ledger(run).owner_alive() and time.monotonic() < deadline:
         time.sleep(0.1)
     found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
     assert (found.condition, found.cause) == ("waiting", Cause.KILLED)
@@ -542,7 +543,7 @@ def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
 ) -> None:
     """Nobody is left to end it but whoever waits for it; and what is merely slow to end is left in peace."""
     grid, manifest, run = faulty(tmp_path, "stop", resources={"grace_seconds": 0.5})
-    lonely, deadline = Supervised(), time.monotonic() + 30
+    lonely, deadline = Supervised(), time.monotonic() + PATIENCE
     lonely.send(task(grid, [run]))
     stopped, attempts = None, Attempts(grid.ledger(run))
     while stopped is None or stopped.status() != psutil.STATUS_STOPPED:

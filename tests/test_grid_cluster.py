@@ -27,7 +27,9 @@ sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.servers import RayHead
 
-pytestmark = [pytest.mark.ray, pytest.mark.timeout(400)]
+from tests.patience import PATIENCE
+
+pytestmark = pytest.mark.ray
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def test_twelve_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tm
     path = write_grid(tmp_path, seeds={"count": 6})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", "jobs")
     both = [start(cluster, *submit) for _ in range(2)]
-    said = [process.communicate(timeout=300)[0] for process in both]
+    said = [process.communicate(timeout=PATIENCE)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     assert all("small: 12 of 12 runs done" in text for text in said)
     grid = Grid(tmp_path / "runs/small")
@@ -71,16 +73,16 @@ def test_twelve_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tm
     assert all("/" not in job["submission_id"] for job in jobs)
     before = metrics(grid, runs)
     again = start(cluster, *submit)
-    assert "12 of 12 runs done" in again.communicate(timeout=120)[0]
+    assert "12 of 12 runs done" in again.communicate(timeout=PATIENCE)[0]
     assert again.returncode == 0
     assert begun(grid, runs) == [1] * 12
     assert metrics(grid, runs) == before
     local = start(cluster, "grid", "run", path, "--root", tmp_path / "local")
-    assert "12 of 12 runs done" in local.communicate(timeout=200)[0]
+    assert "12 of 12 runs done" in local.communicate(timeout=PATIENCE)[0]
     elsewhere = Grid(tmp_path / "local/small")
     assert metrics(elsewhere, elsewhere.manifest().runs()) == before
     status = start(cluster, "grid", "status", grid.folder, "--json")
-    assert json.loads(status.communicate(timeout=60)[0])["counts"] == {"done": 12}
+    assert json.loads(status.communicate(timeout=PATIENCE)[0])["counts"] == {"done": 12}
     assert status.returncode == 0
 
 
@@ -90,7 +92,7 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHe
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", mode)
     submitter = start(cluster, *submit)
     grid = Grid(tmp_path / "runs/small")
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + PATIENCE
 
     def done() -> int:
         runs = grid.manifest().runs() if grid.manifest_file.exists() else []
@@ -108,7 +110,7 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHe
     for process in conductor:
         process.kill()
     again = start(cluster, *submit)
-    said = again.communicate(timeout=300)[0]
+    said = again.communicate(timeout=PATIENCE)[0]
     assert again.returncode == 0, said
     assert "6 of 6 runs done" in said
     runs = grid.manifest().runs()
@@ -124,7 +126,7 @@ def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayHead, tmp_path: P
     work = start(cluster,
         "grid", "work", tmp_path, f"{'0' * 12}:0:1", "--nonce", "ab", "--job", "x"
     )  # fmt: skip
-    said = work.communicate(timeout=60)[0]
+    said = work.communicate(timeout=PATIENCE)[0]
     assert work.returncode == 1
     assert "does not see the grid's folder" in said
     assert "Traceback" not in said
@@ -134,7 +136,7 @@ def test_a_dead_job_server_is_one_clear_sentence(cluster: RayHead, tmp_path: Pat
     submit = start(cluster,
         "grid", "submit", write_grid(tmp_path), "--address", "http://127.0.0.1:9", "--root", tmp_path / "runs"
     )  # fmt: skip
-    said = submit.communicate(timeout=120)[0]
+    said = submit.communicate(timeout=PATIENCE)[0]
     assert submit.returncode == 1
     assert "does not answer" in said
     assert "Traceback" not in said

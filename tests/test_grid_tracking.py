@@ -34,6 +34,8 @@ sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.servers import TrackingServer
 
+from tests.patience import PATIENCE
+
 TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
 
 
@@ -283,7 +285,7 @@ def following(grid: Grid) -> tuple[threading.Thread, list[Any]]:
 
 
 def until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 200
+    deadline = time.monotonic() + PATIENCE
     while not true():
         assert time.monotonic() < deadline
         time.sleep(0.05)

@@ -42,6 +42,7 @@ from space_dist.ledger import (
     encode_row,
     find_ledgers,
 )
+from tests.patience import PATIENCE
 
 quick = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 json_values = st.recursive(
@@ -1054,7 +1055,7 @@ def test_the_owner_keeps_its_lease(ledger: Ledger, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module, "HEARTBEAT_SECONDS", 0.02)
     with RunWriter(ledger):
         first = lock_of(ledger)["heartbeat"]
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE
         while lock_of_or_none(ledger) in (None, first) and time.monotonic() < deadline:
             time.sleep(0.01)
         assert lock_of_or_none(ledger) != first

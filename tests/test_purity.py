@@ -9,6 +9,7 @@ import pytest
 
 import space_dist
 from space_dist import errors
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parent.parent
 HEAVY = ("ray", "torch", "mlflow", "stable_baselines3", "sb3_contrib", "pybullet", "pybullet_data")
@@ -17,7 +18,7 @@ HEAVY = ("ray", "torch", "mlflow", "stable_baselines3", "sb3_contrib", "pybullet
 def imported_with(module: str) -> set[str]:
     """The top-level packages that a fresh interpreter holds once it has imported `module`."""
     program = f"import json, sys, {module}; print(json.dumps(sorted({{name.split('.')[0] for name in sys.modules}})))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     return set(json.loads(done.stdout))
 
@@ -35,7 +36,7 @@ def test_the_curricula_need_no_environment_either():
 
 def test_the_import_contracts_hold():
     program = Path(sys.executable).parent / "lint-imports"
-    done = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, timeout=240)
+    done = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

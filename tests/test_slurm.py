@@ -27,6 +27,7 @@ from space_dist.slurm.node import address_facing
 from space_dist.slurm.profile import seconds
 from space_dist.slurm.queue import queue_of
 from space_dist.standing import Cause, Ended, slurm_job, unheard
+from tests.patience import PATIENCE
 from tests.slurm.profiles import exports
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -75,7 +76,7 @@ class Stubs:
     def run(self, script: Path, *arguments: str, **extra: str) -> tuple[int, str]:
         """Exit code, and all that was said."""
         process = self.start(script, *arguments, **extra)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=PATIENCE)
         return process.returncode, out + err
 
     def calls(self, name: str | None = None) -> list[list[str]]:
@@ -519,7 +520,7 @@ def test_a_users_stop_is_respected(manifest: Manifest, stubs: Stubs, tmp_path: P
 
 
 def _await(path: Path) -> None:
-    until = time.monotonic() + 30
+    until = time.monotonic() + PATIENCE
     while not path.exists():
         assert time.monotonic() < until
         time.sleep(0.01)
@@ -541,7 +542,7 @@ def test_a_signal_becomes_a_flag_file(
     for _ in range(20):  # it may come more than once, at any moment
         process.send_signal(number)
         time.sleep(0.002)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 75, err
     assert ("interrupted; requeued for the 1. time" in out) is requeued
     calls = stubs.calls()
@@ -560,7 +561,7 @@ def test_a_signal_before_anything_runs_is_not_lost(
                           STUB_FLAG=f"{short}/r17/stop", STUB_CODE="75")  # fmt: skip
     _await(loading)
     process.send_signal(signal.SIGUSR1)
-    process.communicate(timeout=30)
+    process.communicate(timeout=PATIENCE)
     assert process.returncode == 75
     assert [call[1:] for call in stubs.calls("scontrol")] == [["requeue", "7_0"]]
     assert not (tmp_path / "w").exists()  # the flag was there before the work began

@@ -26,6 +26,7 @@ from space_dist.slurm import Export, Profile
 from space_dist.slurm import export as write_scripts
 from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
 from space_dist.standing import Attempts
+from tests.patience import PATIENCE
 from tests.slurm.gated_env import GATE
 from tests.slurm.profiles import FIELDS, RESERVATION, exports
 from tests.test_grid_tracking import everything
@@ -33,8 +34,7 @@ from tests.test_tracking import histories
 
 ROOT = Path(__file__).resolve().parent.parent
 HERE = ROOT / "tests/slurm"
-pytestmark = [pytest.mark.slurm, pytest.mark.timeout(600)]
-PATIENCE = 240.0  # seconds
+pytestmark = pytest.mark.slurm
 KINDS = ({"kind": "space"}, {"kind": "round_robin"}, {"kind": "random_growth"}, {"kind": "space", "kappa": 2})
 
 
@@ -45,7 +45,7 @@ class Slurm:
     folder: Path
 
     def ask(self, *command: str) -> str:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=self.environment)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=self.environment)
         assert done.returncode == 0, (command, done.stdout, done.stderr)
         return done.stdout
 
@@ -80,7 +80,7 @@ class Slurm:
 
 @pytest.fixture(scope="module")
 def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
-    installed = subprocess.run([HERE / "install.sh"], capture_output=True, text=True, timeout=300)
+    installed = subprocess.run([HERE / "install.sh"], capture_output=True, text=True, timeout=PATIENCE)
     if installed.returncode:
         pytest.skip(f"Slurm cannot be installed here: {installed.stderr.strip().splitlines()[-1]}")
     probe = (
@@ -93,18 +93,18 @@ def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
         )
     found = Slurm(tmp_path_factory.mktemp("slurm"))
     try:
-        up = subprocess.run([HERE / "up.sh", found.folder], capture_output=True, text=True, timeout=120)
+        up = subprocess.run([HERE / "up.sh", found.folder], capture_output=True, text=True, timeout=PATIENCE)
         assert up.returncode == 0, up.stdout + up.stderr
         yield found
     finally:
-        subprocess.run([HERE / "down.sh", found.folder], capture_output=True, timeout=120)
+        subprocess.run([HERE / "down.sh", found.folder], capture_output=True, timeout=PATIENCE)
 
 
 def space_dist(*arguments: object, slurm: Slurm | None = None) -> str:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)} if slurm is None else slurm.environment
     done = subprocess.run(
         [sys.executable, "-m", "space_dist.cli", *map(str, arguments)],
-        capture_output=True, text=True, timeout=2 * PATIENCE, env=environment, cwd=ROOT,
+        capture_output=True, text=True, timeout=PATIENCE, env=environment, cwd=ROOT,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -291,7 +291,7 @@ def test_one_ray_over_two_nodes_survives_the_loss_of_one(slurm: Slurm, reference
     os.kill(slurm.node_holder(2), signal.SIGKILL)
     await_(lambda: slurm.job(train).get("Restarts") == "1", "the job to be requeued", folder)
     gate.unlink()
-    subprocess.run([HERE / "up.sh", slurm.folder, "node", "2"], check=True, timeout=60)
+    subprocess.run([HERE / "up.sh", slurm.folder, "node", "2"], check=True, timeout=PATIENCE)
     assert await_end(slurm, aggregate, folder) == "COMPLETED"
     assert slurm.job(train)["JobState"] == "COMPLETED"
     assert "eight: 8 of 8 runs done" in (folder / f"logs/eight-aggregate-{aggregate}.out").read_text()
@@ -306,7 +306,7 @@ def test_sbatch_reads_hostile_values_as_text(slurm: Slurm, reference: Grid, tmp_
         (tmp_path / AGGREGATE).write_text(render(made)[AGGREGATE])
         held = subprocess.run(
             ["sbatch", "--parsable", "--hold", AGGREGATE], cwd=tmp_path, env=slurm.environment, text=True,
-            capture_output=True, check=True, timeout=60,
+            capture_output=True, check=True, timeout=PATIENCE,
         )  # fmt: skip
         job = held.stdout.strip()
         shown = slurm.ask("scontrol", "show", "job", job)
@@ -319,7 +319,7 @@ def test_sbatch_accepts_every_drawn_profile(slurm: Slurm, reference: Grid, tmp_p
     def objection(folder: Path, script: str) -> str:
         done = subprocess.run(
             ["sbatch", "--test-only", script], cwd=folder, env=slurm.environment, text=True, capture_output=True,
-            timeout=60,
+            timeout=PATIENCE,
         )  # fmt: skip
         assert (done.returncode == 0) is ("to start at" in done.stderr), done.stderr
         return "" if done.returncode == 0 else done.stderr

@@ -34,7 +34,6 @@ POPULATIONS = ("kill driver",)
 
 @pytest.mark.ray
 @pytest.mark.server
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize(("engine", "kinds"), [("single", BOUNDED), ("population", POPULATIONS)])
 def test_a_grid_under_faults_is_the_grid_left_alone(
     engine: str, kinds: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -19,6 +19,7 @@ from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.ledger import Ledger
 from tests.faults.injection import Disk, Kills, bury_owner
+from tests.patience import PATIENCE
 from tests.test_learners import ROUNDS, config_for, crashed, learner_section, results, with_checkpoints
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -123,7 +124,7 @@ def test_a_run_killed_twice_by_sigkill_is_resumed_to_the_same_bytes(learner: str
     for target in (5, 13):
         process = subprocess.Popen([sys.executable, "-c", DRIVER, str(file), str(folder)], cwd=ROOT)
         try:
-            deadline = time.monotonic() + 60
+            deadline = time.monotonic() + PATIENCE
             while reached(folder) < target and process.poll() is None and time.monotonic() < deadline:
                 time.sleep(0.003)
             assert process.poll() is None, "the run ended before it could be killed"

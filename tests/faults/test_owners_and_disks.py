@@ -16,6 +16,7 @@ from space_dist.ledger import Ledger
 from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
 from tests.faults.test_requests import ROOT, command
+from tests.patience import PATIENCE
 from tests.test_learners import results
 
 
@@ -43,7 +44,7 @@ def test_of_two_processes_on_two_hosts_one_works_and_the_other_says_why(tmp_path
         )
         for number in (1, 2)
     ]  # fmt: skip
-    said = [process.communicate(timeout=120) for process in both]
+    said = [process.communicate(timeout=PATIENCE) for process in both]
     codes = [process.returncode for process in both]
     assert sorted(codes) == [0, 1], said
     winner, loser = codes.index(0), codes.index(1)
@@ -69,12 +70,12 @@ def test_a_full_disk_is_one_sentence_and_the_run_goes_on_once_there_is_room(tmp_
     config = short(tmp_path, "ppo", 4)
     launch(config, tmp_path / "reference", resume=True, stop=StopRequests())
     train = [*command(tmp_path)[:-2], "--out", str(small_disk / "run")]
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 1
     assert "the disk is full" in done.stderr
     assert "Traceback" not in done.stderr
     assert can("mount", "-o", "remount,size=4m", str(small_disk))
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert results(small_disk / "run") == results(tmp_path / "reference")
 
@@ -82,7 +83,7 @@ def test_a_full_disk_is_one_sentence_and_the_run_goes_on_once_there_is_room(tmp_
 def test_a_read_only_folder_is_one_sentence(tmp_path: Path, small_disk: Path) -> None:
     assert can("mount", "-o", "remount,ro", str(small_disk))
     train = [*command(tmp_path)[:-2], "--out", str(small_disk / "run")]
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 1
     assert "the file system is read-only" in done.stderr
     assert "Traceback" not in done.stderr
@@ -91,6 +92,6 @@ def test_a_read_only_folder_is_one_sentence(tmp_path: Path, small_disk: Path) ->
 
 def test_a_dead_tracking_server_is_a_warning(tmp_path: Path) -> None:
     train = command(tmp_path, "tracking.uri=http://127.0.0.1:9", "tracking.live=false")
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert Ledger(tmp_path / "run").status().state == "done"

@@ -17,6 +17,7 @@ from space_dist.launch import launch
 from space_dist.ledger import Ledger
 from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
+from tests.patience import PATIENCE
 from tests.test_learners import results
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -81,12 +82,12 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
     )
     process = subprocess.Popen(slow, cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, PAUSE: "0.3"})
     try:
-        deadline = time.monotonic() + 100
+        deadline = time.monotonic() + PATIENCE
         while not list((tmp_path / "run" / "checkpoints").glob("round-*2.npz")) and time.monotonic() < deadline:
             time.sleep(0.01)
             assert process.poll() is None
         process.send_signal(signal.SIGUSR1)
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
     assert process.returncode == 75, said
@@ -109,12 +110,12 @@ def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float) 
         text=True,
     )
     try:
-        log, deadline = tmp_path / "run" / "log.txt", time.monotonic() + 100
+        log, deadline = tmp_path / "run" / "log.txt", time.monotonic() + PATIENCE
         while not log.exists() and time.monotonic() < deadline:  # what is written just before Ray is started
             time.sleep(0.01)
         time.sleep(4.0 * progress)
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=120)
+        _, said = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
     assert process.returncode == 75, said

@@ -94,9 +94,9 @@ munged --force --key-file="$D/munge.key" --socket="$D/run/munge.socket" --pid-fi
 unshare --mount bash -c 'mount --bind "$0" /etc/hosts && slurmctld' "$D/hosts" # it binds to what its host name means
 for i in $(seq "$NODES"); do start_node "$i"; done
 SECONDS=0
-while [ $SECONDS -lt 60 ]; do
+while [ $SECONDS -lt 300 ]; do
   [ "$(timeout 5 sinfo -h -p debug -N -r -t idle -o %N 2>/dev/null | wc -l)" = "$NODES" ] && exit 0
   sleep 0.2
 done
-echo "up.sh: the nodes are not idle after 60 s; see $D/log" >&2
+echo "up.sh: the nodes are not idle after 300 s; see $D/log" >&2
 exit 1
