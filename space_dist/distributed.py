@@ -14,10 +14,12 @@ import contextlib
 import logging
 import os
 import shutil
+import socket
 import statistics
+import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -39,7 +41,8 @@ from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
-_STARTS = 3  # of a Ray of our own
+_STARTS = 5  # of a Ray of our own
+_TURN_SECONDS = 300.0  # that one waits for others to be up
 _ATTEMPTS = 6  # at one call, or at one actor's start, before something must be wrong with the work itself
 _LOOK_SECONDS = 0.2  # between two looks for what died or is late
 _RESCHEDULING_SECONDS = 5.0  # that Ray gets to find other room for a lost node's actors
@@ -442,8 +445,8 @@ class RayCluster:
 def join_ray(address: str, cpus: int) -> dict[str, Any]:
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
-    A start that fails is tried again: Ray gives its processes 30 s, in which a busy machine may not come to them.
-    Raises SpaceDistError if Ray cannot be started or reached.
+    A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
+    not enough on a busy machine. Raises SpaceDistError if Ray cannot be started or reached.
     """
     ours = address == "local"
     options: dict[str, Any] = (
@@ -453,9 +456,11 @@ def join_ray(address: str, cpus: int) -> dict[str, Any]:
     while True:
         before = set(psutil.Process().children())
         try:
-            context = ray.init(
-                address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False, **options
-            )
+            with _turn_to_start() if ours else contextlib.nullcontext():
+                context = ray.init(
+                    address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
+                    **options,
+                )  # fmt: skip
         except Exception as error:  # Ray raises bare ones, too
             failures += 1
             what = _first_line(error)
@@ -469,6 +474,23 @@ def join_ray(address: str, cpus: int) -> dict[str, Any]:
         else:
             found: dict[str, Any] = context.address_info  # type: ignore[attr-defined]
             return found
+
+
+@contextlib.contextmanager
+def _turn_to_start() -> Iterator[None]:
+    """Wait for other Rays of ours on this machine to be up: together, nine processes each, all would be too slow.
+
+    An abstract socket is held, which is nobody's file, and free again whatever becomes of its holder.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as turn:
+        until = time.monotonic() + _TURN_SECONDS
+        while sys.platform == "linux" and time.monotonic() < until:
+            try:
+                turn.bind(f"\0space_dist starts a Ray for {os.getuid()}")
+                break
+            except OSError:
+                time.sleep(_LOOK_SECONDS)
+        yield
 
 
 def remove_session(folder: str | None) -> None:

@@ -11,6 +11,7 @@ from hypothesis import settings
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+os.environ.setdefault("RAY_worker_niceness", "0")  # beside other tests, the nice ones' turn would hardly ever come
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

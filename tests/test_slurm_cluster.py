@@ -146,7 +146,7 @@ def export(
     profile.write_text(to_yaml({
         "mem": 1500, "temp": "/var/tmp", "signal": {"lead_seconds": 115},  # noqa: S108 - the nodes' own
         "command": [sys.executable, "-m", "space_dist.cli"],
-        "env": {"PYTHONPATH": python_path, GATE: str(gate)}, **more,
+        "env": {"PYTHONPATH": python_path, GATE: str(gate), "RAY_worker_niceness": "0"}, **more,
     }))  # fmt: skip
     space_dist("slurm", "export", grid, "--out", out, "--profile", profile, *options, slurm=slurm)
     return out
