@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import signal
 import subprocess
 import threading
@@ -151,6 +152,26 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
             pass
         assert begun == [address] * starts
         begun.clear()
+
+
+def test_rays_of_our_own_start_one_at_a_time(cluster_class: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = importlib.import_module(cluster_class.__module__)
+    order = []
+
+    def other() -> None:
+        with module._turn_to_start():
+            order.append("other")
+
+    thread = threading.Thread(target=other)
+    with module._turn_to_start():
+        thread.start()
+        time.sleep(0.5)
+        order.append("first")
+    thread.join()
+    assert order == ["first", "other"]
+    monkeypatch.setattr(module, "_TURN_SECONDS", 0.3)
+    with module._turn_to_start(), module._turn_to_start():  # one that never ends holds nobody up
+        pass
 
 
 def _setup(run: configs.RunConfig) -> Any:
