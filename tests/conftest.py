@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import settings
@@ -54,6 +56,25 @@ def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
     (tmp_path / "cwd").mkdir()
     monkeypatch.chdir(tmp_path / "cwd")
     return f"sqlite:///{store / 'mlflow.db'}"
+
+
+@pytest.fixture(scope="module")
+def one_ray() -> Iterator[None]:
+    """One private Ray for all clusters of a module: to start it takes longer than the runs."""
+    from space_dist.launch import private_ray
+
+    private_ray()
+    import ray
+
+    from space_dist.distributed import join_ray, remove_session
+
+    session = join_ray("local", 5)["session_dir"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ray, "init", lambda **_: SimpleNamespace(address_info={"session_dir": None}))  # none of its own
+        patch.setattr(ray, "shutdown", lambda: None)
+        yield
+    ray.shutdown()
+    remove_session(session)
 
 
 # How long an example takes says more about the machine than about us.

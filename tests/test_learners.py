@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,7 @@ from space_dist.config import RunConfig
 from space_dist.envs.observations import Observations, rows
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, policy_of, private_ray, read_instances
+from space_dist.launch import launch, policy_of, read_instances
 from space_dist.learner import make_learner
 from space_dist.learner.networks import TorchPolicy
 from space_dist.learner.normaliser import Normaliser
@@ -176,20 +174,6 @@ def test_another_seed_is_another_run(kind: str, references: Any, tmp_path: Path)
     config, _, expected = references[kind]
     for name, content in run(config.model_copy(update={"seed": 1}), tmp_path / "run").items():
         assert content != expected[name] or name == "model.json", name
-
-
-@pytest.fixture(scope="module")
-def one_ray() -> Iterator[None]:
-    """One Ray for all of this module's clusters: to start it takes longer than the runs."""
-    private_ray()
-    import ray
-
-    ray.init(address="local", num_cpus=5, include_dashboard=False, log_to_driver=False, object_store_memory=256 << 20)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray, "init", lambda **_: SimpleNamespace(address_info={"session_dir": None}))  # none of its own
-        patch.setattr(ray, "shutdown", lambda: None)
-        yield
-    ray.shutdown()
 
 
 @pytest.mark.ray

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,7 @@ from space_dist import config as configs
 from space_dist.errors import Interrupted
 from space_dist.instances import sample
 from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, private_ray
+from space_dist.launch import launch
 from space_dist.learner import Ensemble
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from space_dist.report import draw_curriculum, load_run
@@ -97,26 +95,6 @@ def test_interrupted_after_every_round_and_resumed_it_is_the_same(
             interruptions += 1
     assert interruptions >= 4
     assert results(tmp_path / "run") == results(reference(kind))
-
-
-@pytest.fixture(scope="module")
-def one_ray() -> Iterator[None]:
-    """One private Ray for all runs of this module: starting and ending it is not what is tested here."""
-    private_ray()
-    import ray
-
-    from space_dist import distributed  # noqa: F401 - sets what Ray reads when it is imported
-
-    ray.init(
-        address="local", num_cpus=5, include_dashboard=False, log_to_driver=False, object_store_memory=128 << 20,
-        configure_logging=False,
-    )  # fmt: skip
-    patch = pytest.MonkeyPatch()
-    patch.setattr(ray, "init", lambda **_: SimpleNamespace(address_info={"session_dir": None}))  # none of its own
-    patch.setattr(ray, "shutdown", lambda: None)
-    yield
-    patch.undo()
-    ray.shutdown()
 
 
 @pytest.mark.ray

@@ -22,7 +22,7 @@ from space_dist.errors import SpaceDistError
 
 _START_SECONDS = 120.0
 _END_SECONDS = 20.0
-_STARTS = 3  # what was killed may hold its ports for a moment
+_STARTS = 5  # what was killed may hold its ports for a moment, and Ray gives up on a busy machine
 
 
 class _Server:
