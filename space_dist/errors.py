@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 
 class SpaceDistError(Exception):
@@ -36,3 +37,13 @@ def nearest(word: str, allowed: Iterable[str]) -> str:
     """`"; did you mean 'eta'?"` where one of `allowed` resembles `word`, else `"."`: the end of a clause."""
     close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else "."
+
+
+@contextlib.contextmanager
+def about(where: str) -> Iterator[None]:
+    """Say where a fault lies: the file or key goes before its sentence, unless it is there already."""
+    try:
+        yield
+    except ConfigError as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith((where, "--set ")) else f"{where}: {text}") from error

@@ -1,9 +1,9 @@
-"""Grids: a YAML file becomes a manifest, a manifest becomes finished runs.
+"""From a grid's frozen manifest, which `planning` makes, to finished runs.
 
-`plan` resolves and checks every cell and freezes the manifest. `conduct` is the one loop that works on a grid, wherever
-its runs are computed: an `Executor` starts them and says how they ended. Finished runs are skipped, unfinished ones go
-on from their checkpoints, failed ones are tried again as the grid's `retry` allows. One conductor at a time works on a
-grid; another waits, and takes over when the first is gone.
+A `Conductor` is the one loop that works on a grid, wherever its runs are computed: an `Executor` starts them and says
+how they ended. Finished runs are skipped, unfinished ones go on from their checkpoints, failed ones are tried again as
+the grid's `retry` allows. One conductor at a time works on a grid; another waits, and takes over when the first is
+gone. It trains nothing, so nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
-import hashlib
 import logging
 import os
 import signal
@@ -21,18 +20,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from space_dist import config as configs
-from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
-from space_dist.instances import InstanceSet
-from space_dist.launch import about, absolute_uri, read_instances
 from space_dist.ledger import Lock
-from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, Run, label_of, load_grid
-from space_dist.provenance import code_digest, git_state, source_digest
+from space_dist.manifest import Grid, Manifest, Run
+from space_dist.provenance import code_digest
 from space_dist.standing import Attempts, Ended, Standing, may_retry, standing_of, standings, unheard
-from space_dist.training import make_env, make_setup, memory_of, resolved, stack_of, total_steps
 
 log = logging.getLogger("space_dist")
 
@@ -46,62 +40,17 @@ _LIBRARIES_MB = 700  # of a process that trains, before it has a run
 MEMBERS = {"cpu": 32, "cuda": 1024}  # of a population, at most: more gain little, and are lost together
 
 
-# ---- from a file to a manifest --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A frozen grid, and how it differs from what was frozen in its folder before. steps: of all runs together."""
-
-    grid: Grid
-    manifest: Manifest
-    steps: int
-    new_runs: int
-    dropped_runs: int
-
-
-def plan(path: Path, root: Path) -> Plan:
-    """Resolve and check a grid file, and freeze it in `<root>/<name>`.
-
-    A grid that was frozen before is frozen anew: runs of cells that are still there keep their results. Raises
-    ConfigError for every fault of the files, and if somebody is working on another version of the grid now.
-    """
-    config, points = load_grid(path)
-    grid = Grid(root.absolute() / config.name)
-    files = _InstanceFiles()
-    cells: dict[str, Cell] = {}
-    steps = 0
-    for point, data in points:
-        label = label_of(point, config.axes())
-        cell, run_steps = _cell(config, point, label, data, f"{path}, cell {label!r}", files)
-        if cell.id in cells:
-            raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
-        cells[cell.id] = cell
-        steps += run_steps * len(config.seed_list())
-    manifest = Manifest(
-        name=config.name, axes=tuple(config.axes()), cells=_distinct(cells.values()), seeds=config.seed_list(),
-        resources=config.resources, retry=config.retry,
-        tracking=config.tracking.model_copy(update={"uri": absolute_uri(config.tracking.uri)}),
-        baseline=_baseline(path, config, list(cells.values())),
-        instances={name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.contents.items())},
-        code=code_digest(), git=git_state(),
-    )  # fmt: skip
-    before = _freeze(grid, manifest, files.contents)
-    now, then = ({run.key for run in one.runs()} if one else set[str]() for one in (manifest, before))
-    return Plan(grid, grid.manifest(), steps, len(now - then), len(then - now))
-
-
 def adopt(source: Grid, root: Path) -> Grid:
     """The same frozen grid below another root: what was exported is run where there is room."""
     manifest = source.manifest()
     grid = Grid(root.absolute() / manifest.name)
     if grid.folder.resolve() != source.folder.resolve():
-        _freeze(grid, manifest, source.instance_files(manifest))
+        freeze(grid, manifest, source.instance_files(manifest))
     return grid
 
 
-def _freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
-    """Returns the manifest that was there before. Tasks of a batch system may all do this at once."""
+def freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
+    """Make this the grid's manifest, as tasks of a batch system may all do at once; returns the one before it."""
     try:
         grid.folder.mkdir(parents=True, exist_ok=True)
         with (grid.folder / "manifest.lock").open("w") as lock:
@@ -129,80 +78,6 @@ def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Ma
             )
     grid.freeze(manifest, files)
     return before
-
-
-class _InstanceFiles:
-    """Instance sets of all cells: each file read once, each set stored once, named by its content."""
-
-    def __init__(self) -> None:
-        self.contents: dict[str, bytes] = {}
-        self._read: dict[tuple[object, ...], tuple[InstanceSet, InstanceSet]] = {}
-        self._names: dict[int, str] = {}
-
-    def sets(self, config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
-        bounds = make_env(config).context_bounds
-        key = (config.instances.train, config.instances.test, bounds)
-        if key not in self._read:
-            self._read[key] = read_instances(config)
-        return self._read[key]
-
-    def name(self, instances: InstanceSet) -> str:
-        if id(instances) not in self._names:  # `_read` keeps them all alive
-            name = f"{instances.digest()[:16]}.csv"
-            self.contents[name] = instances.to_csv().encode()
-            self._names[id(instances)] = name
-        return self._names[id(instances)]
-
-
-def _cell(
-    grid: GridConfig, point: dict[str, Any], label: str, data: dict[str, Any], where: str, files: _InstanceFiles
-) -> tuple[Cell, int]:
-    """A cell, and the environment steps of each of its runs."""
-    for key in ("tracking", "resources", "seed"):  # the grid's own
-        data.pop(key, None)
-    name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
-    config = configs.parse({**data, "name": name}, where)
-    with about(where):
-        config = resolved(config, can_share=grid.resources.workers == 0)
-        if config.engine == "population" and grid.resources.workers:
-            raise ConfigError(
-                f"engine: population with resources.workers: {grid.resources.workers}: runs that share a process have "
-                "no rollout actors of their own; use workers: 0, or engine: single"
-            )
-        train, test = files.sets(config)
-        make_setup(config, train, test)
-        paths = [path for path in (config.env.id, getattr(config.learner, "policy", "")) if ":" in path]
-        sources = {path: source_digest(path) for path in paths}
-    identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
-    data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
-    data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
-                             (("train", train), ("test", test))}  # fmt: skip
-    steps = total_steps(config, make_env(config).horizon)
-    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config), memory_of(config)), steps
-
-
-def _distinct(cells: Any) -> tuple[Cell, ...]:
-    """Labels that were cut to the same words get the start of the id."""
-    found = list(cells)
-    labels = [cell.label for cell in found]
-    return tuple(
-        cell if labels.count(cell.label) == 1 else dataclasses.replace(cell, label=f"{cell.label} {cell.id[:6]}")
-        for cell in found
-    )
-
-
-def _baseline(path: Path, config: GridConfig, cells: Sequence[Cell]) -> str:
-    if config.baseline:
-        found = [cell for cell in cells
-                 if all(cell.settings[key] == value for key, value in config.baseline.items())]  # fmt: skip
-        if len(found) != 1:
-            raise ConfigError(f"{path}: baseline: {len(found)} cells have these settings; it must be exactly one")
-        return found[0].id
-    round_robin = [cell for cell in cells if cell.config["curriculum"]["kind"] == "round_robin"]
-    return (round_robin or list(cells))[0].id
-
-
-# ---- from a manifest to finished runs -------------------------------------------------------------------------------
 
 
 class Executor(Protocol):

@@ -7,8 +7,6 @@ import contextvars
 import io
 import json
 import logging
-import os
-import secrets
 import subprocess
 import sys
 import time
@@ -24,11 +22,12 @@ from threadpoolctl import threadpool_limits
 from space_dist import config as configs
 from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError, about
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_device
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
+from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
@@ -48,11 +47,6 @@ class Outcome:
     tracking_warning: str | None = None
 
 
-def default_folder(config: RunConfig) -> Path:
-    """`runs/<name>/s<seed>`, here."""
-    return workplace() / "runs" / config.name / f"s{config.seed}"
-
-
 def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
     """The training and test instances of a config. Raises ConfigError for a bad file, or one that shares a context."""
     bounds = make_env(config).context_bounds
@@ -63,16 +57,6 @@ def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
         test = read_csv(config.instances.test, bounds, columns, if_there=True)
     refuse_overlap(train, test, str(config.instances.train), str(config.instances.test))
     return train, test
-
-
-@contextlib.contextmanager
-def about(where: str) -> Iterator[None]:
-    """Say where a fault lies: the file or key goes before its sentence, unless it is there already."""
-    try:
-        yield
-    except ConfigError as error:
-        text = str(error)
-        raise ConfigError(text if text.startswith((where, "--set ")) else f"{where}: {text}") from error
 
 
 def launch(
@@ -260,35 +244,6 @@ def _self_contained(config: RunConfig) -> RunConfig:
     )
 
 
-def absolute_uri(uri: str | None) -> str | None:
-    """A tracking URI that means the same from any folder: `sqlite:///FILE` with the file's absolute path."""
-    prefix = "sqlite:///"
-    return f"{prefix}{workplace() / uri.removeprefix(prefix)}" if uri and uri.startswith(prefix) else uri
-
-
-def in_ray_job() -> bool:
-    """Whether `ray job submit` started this process."""
-    return "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
-
-
-def workplace() -> Path:
-    """Where results go whose place nobody named: here; from within a Ray job, `~/space_dist`.
-
-    A job's current folder is a copy that Ray removes when it needs the space.
-    """
-    return Path.home() / "space_dist" if in_ray_job() else Path.cwd()
-
-
-def lasting(path: Path, option: str) -> Path:
-    """The absolute path of a folder for results. Raises ConfigError for a relative one from within a Ray job."""
-    if in_ray_job() and not path.is_absolute():
-        raise ConfigError(
-            f"{option} {path}: from within a Ray job the path must be absolute, on storage that outlives the job; "
-            "the job's current folder is a copy that Ray removes when it needs the space"
-        )
-    return path.absolute()
-
-
 def policy_of(ledger: Ledger) -> Policy | Several:
     """The policy, or policies, of a finished run, or those of an unfinished one's last checkpoint.
 
@@ -308,16 +263,6 @@ def policy_of(ledger: Ledger) -> Policy | Several:
     if checkpoint is None:
         raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
     return policy_in(checkpoint, stored_config(ledger))
-
-
-def private_ray() -> None:
-    """Prepare this process for Rays of its own; to be called before Ray is imported, which reads these once.
-
-    Ray runs whatever its ports are sent, so only who holds this process's own token may talk to them. (Unset, Ray makes
-    up a token and leaves it in the user's home.)
-    """
-    if "ray" not in sys.modules:
-        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
 
 
 @contextlib.contextmanager

@@ -61,7 +61,7 @@ def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
 @pytest.fixture(scope="module")
 def one_ray() -> Iterator[None]:
     """One private Ray for all clusters of a module: to start it takes longer than the runs."""
-    from space_dist.launch import private_ray
+    from space_dist.place import private_ray
 
     private_ray()
     import ray

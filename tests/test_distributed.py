@@ -15,8 +15,9 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, private_ray, read_instances
+from space_dist.launch import launch, read_instances
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.place import private_ray
 from space_dist.training import learner_of, make_setup
 from tests.patience import PATIENCE
 

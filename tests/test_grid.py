@@ -22,9 +22,10 @@ import pytest
 from space_dist import config as configs
 from space_dist import supervisor
 from space_dist.errors import ConfigError, Interrupted, LedgerError
-from space_dist.grid import Conductor, plan
+from space_dist.grid import Conductor
 from space_dist.ledger import METRICS, Lock, Row
 from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
+from space_dist.planning import plan
 from space_dist.provenance import source_digest
 from space_dist.standing import Attempts, Cause, Ended, exit_code, last_lines, standing_of, standings
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances

@@ -16,10 +16,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from space_dist.grid import plan
-from space_dist.launch import private_ray
 from space_dist.ledger import METRICS, this_process
 from space_dist.manifest import Grid, Run
+from space_dist.place import private_ray
+from space_dist.planning import plan
 from space_dist.standing import Attempts
 from tests.grids import ROOT, write_grid
 

@@ -20,9 +20,9 @@ from scipy import stats
 
 from space_dist.cli import main
 from space_dist.errors import ConfigError
-from space_dist.grid import plan
 from space_dist.ledger import Ledger, RunWriter
 from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
+from space_dist.planning import plan
 from space_dist.report import build_grid_report
 from space_dist.report.document import Document, Section, escaped, to_html, to_markdown
 from space_dist.report.grid import compare, heat_maps, pool, read_cells

@@ -30,6 +30,11 @@ def test_importing_it_imports_nothing_heavy(module: str):
     assert not imported.intersection(HEAVY)
 
 
+@pytest.mark.parametrize("module", ["space_dist.ray_jobs", "space_dist.supervisor", "space_dist.slurm"])
+def test_whoever_only_starts_runs_does_not_wait_for_torch(module: str):
+    assert not imported_with(module).intersection({"torch", "mlflow", "stable_baselines3", "sb3_contrib"})
+
+
 def test_the_curricula_need_no_environment_either():
     assert "gymnasium" not in imported_with("space_dist.curricula")
 

@@ -19,8 +19,9 @@ import pytest
 
 from space_dist import cli
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
-from space_dist.grid import Conductor, adopt, plan, working_on
+from space_dist.grid import Conductor, adopt, working_on
 from space_dist.manifest import Grid, Manifest, Run
+from space_dist.planning import plan
 from space_dist.slurm import Export, Mode, Profile, export, load_profile
 from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN, render
 from space_dist.slurm.node import address_facing

@@ -30,8 +30,9 @@ from space_dist.envs import BatchedEnv, ContextObservation, make_batched, make_s
 from space_dist.errors import Interrupted
 from space_dist.instances import ContextBounds, read_csv
 from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, private_ray
+from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from space_dist.place import private_ray
 from space_dist.training import Progress
 
 ROOT = Path(__file__).resolve().parents[2]

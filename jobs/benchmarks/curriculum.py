@@ -18,7 +18,7 @@ from space_dist import config as configs
 from space_dist.cluster import Central, Evidence, InProcess
 from space_dist.curricula import SetState
 from space_dist.instances import sample
-from space_dist.launch import private_ray
+from space_dist.place import private_ray
 from space_dist.rollout import Walk
 from space_dist.training import learner_of, make_setup
 

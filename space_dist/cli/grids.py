@@ -55,7 +55,7 @@ _UNFINISHED = 3
 @grid_app.command("plan")
 def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
     """Check a grid, print its cells and what is done already, and freeze its manifest."""
-    from space_dist.grid import plan
+    from space_dist.planning import plan
     from space_dist.provenance import code_digest
     from space_dist.standing import standings
 
@@ -295,7 +295,7 @@ def grid_work(
 ) -> None:
     """One attempt of one run, or of several side by side, as a job of its own."""
     STOP.install()
-    from space_dist.launch import lasting
+    from space_dist.place import lasting
     from space_dist.ray_pool import refuse_other_folder
     from space_dist.standing import Cause
     from space_dist.supervisor import Supervisor, Task, Turn, preload
@@ -347,26 +347,28 @@ def _prepare(address: str) -> None:
     """What must come before Ray, and anything else that is heavy, is imported."""
     STOP.install()
     if address == "local":
-        from space_dist.launch import private_ray
+        from space_dist.place import private_ray
 
         private_ray()
 
 
 def _root(root: Path | None) -> Path:
-    from space_dist.launch import lasting, workplace
+    from space_dist.place import lasting, workplace
 
     return workplace() / "runs" if root is None else lasting(root, "--root")
 
 
 def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
     """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
-    from space_dist.grid import adopt, plan
+    from space_dist.grid import adopt
     from space_dist.manifest import MANIFEST, find_grid
 
     if path.is_dir() or path.name == MANIFEST:
         source = find_grid(path, root)
         place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
         return place, place.manifest()
+    from space_dist.planning import plan  # imports torch, to see whether every cell can learn
+
     made = plan(path, root)
     return made.grid, made.manifest
 

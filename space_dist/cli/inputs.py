@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 from space_dist.cli.terminal import Kwargs, Overrides, console, parse_kwargs, say, write
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, about
 
 instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
 config_app = typer.Typer(no_args_is_help=True, help="Explain and check configs.")
@@ -95,7 +95,7 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
-    from space_dist.launch import about, read_instances
+    from space_dist.launch import read_instances
     from space_dist.training import make_setup
 
     run = configs.load(config, list(overrides or []))

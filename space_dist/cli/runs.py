@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from space_dist.cli.terminal import STOP, Json, Overrides, console, say, warn, write
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, about
 
 if TYPE_CHECKING:
     from space_dist.manifest import Grid
@@ -44,7 +44,8 @@ def train(
     """Train one policy under one curriculum."""
     STOP.install()
     from space_dist import config as configs
-    from space_dist.launch import about, default_folder, lasting, launch
+    from space_dist.launch import launch
+    from space_dist.place import default_folder, lasting
 
     settings = list(overrides or [])
     if workers is not None:
@@ -163,7 +164,7 @@ def _grid(path: Path, root: Path | None) -> Grid:
     from space_dist.manifest import find_grid
 
     if root is None and path.suffix in _YAML:  # only then, for this imports torch
-        from space_dist.launch import workplace
+        from space_dist.place import workplace
 
         root = workplace() / "runs"
     return find_grid(path, root or Path())

@@ -122,8 +122,8 @@ def _frozen(path: Path) -> tuple[Manifest, Mapping[str, bytes]]:
     """A grid that is frozen already, or frozen now from its YAML file, with its instance files."""
     import tempfile
 
-    from space_dist.grid import plan
     from space_dist.manifest import MANIFEST, find_grid
+    from space_dist.planning import plan
 
     with contextlib.ExitStack() as stack:
         if path.is_dir() or path.name == MANIFEST:

@@ -14,7 +14,8 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, private_ray
+from space_dist.launch import launch
+from space_dist.place import private_ray
 from tests.faults.test_every_write import short
 from tests.test_learners import results
 
