@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from space_dist import config as configs
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from tests.patience import PATIENCE
 
@@ -19,18 +22,26 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
 
 
-def train(out: Path, learner: str, *arguments: str, seed: int = 0, workers: int = 0, resume: bool = False) -> list[str]:
-    settings = [  # sixteen short rounds
+CONFIG = ROOT / "configs/pointmass_space.yaml"
+
+
+def settings(learner: str) -> list[str]:
+    """Sixteen short rounds."""
+    made = [
         "budget.steps=8192", "learner.n_steps=512", "rollout.slots=1", "evaluation.every_steps=4096",
         "checkpoint.every_rounds=1", "tracking.uri=null",
     ]  # fmt: skip
     if learner == "trpo":  # the shipped config is PPO's: what only PPO has goes
-        settings.append(
+        made.append(
             "learner={kind: trpo, n_steps: 512, gamma: 0.95, gae_lambda: 0.99, net_arch: [64, 64], target_kl: 0.004}"
         )
-    command = [sys.executable, "-m", "space_dist.cli", "train", str(ROOT / "configs/pointmass_space.yaml")]
-    command += ["--out", str(out), "--seed", str(seed), "--workers", str(workers), *arguments]
-    for setting in settings:
+    return made
+
+
+def train(out: Path, learner: str, *, seed: int = 0, workers: int = 0, resume: bool = False) -> list[str]:
+    command = [sys.executable, "-m", "space_dist.cli", "train", str(CONFIG)]
+    command += ["--out", str(out), "--seed", str(seed), "--workers", str(workers)]
+    for setting in settings(learner):
         command += ["--set", setting]
     return [*command, "--resume"] if resume else command
 
@@ -46,17 +57,19 @@ def results(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module", params=["ppo", "trpo"])
 def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """An undisturbed run without Ray."""
+    """An undisturbed run without Ray, in a process of its own."""
     folder = tmp_path_factory.mktemp(request.param) / "reference"
     run(train(folder, request.param))
     return request.param, folder
 
 
 @pytest.mark.ray
+@pytest.mark.usefixtures("one_ray")
 @pytest.mark.parametrize("workers", [1, 2, 4])
 def test_the_number_of_workers_changes_no_byte(reference: tuple[str, Path], workers: int, tmp_path: Path) -> None:
     learner, folder = reference
-    run(train(tmp_path / "run", learner, workers=workers))
+    config = configs.load(CONFIG, [*settings(learner), f"resources.workers={workers}"])
+    launch(config, tmp_path / "run", resume=False, stop=StopRequests())
     assert results(tmp_path / "run") == results(folder)
 
 
@@ -90,7 +103,7 @@ def test_killed_five_times_and_resumed_it_is_the_same(reference: tuple[str, Path
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
     assert Ledger(out).status().state == "running"  # nobody was left to say otherwise
-    run(train(out, learner, resume=True))
+    run(train(out, learner, workers=2, resume=True))
     assert results(out) == results(folder)
     assert Ledger(out).status().state == "done"
 
