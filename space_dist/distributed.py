@@ -19,7 +19,7 @@ import statistics
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -128,8 +128,9 @@ class RayCluster:
     for its actors, the run goes on with fewer. Raises SpaceDistError if Ray cannot be reached or has no room.
     """
 
-    def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._config, self._resources, self._setup = config, config.resources, setup
+    def __init__(self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None) -> None:
+        """As `join_ray` for `heed`."""
+        self._config, self._resources, self._setup, self._heed = config, config.resources, setup, heed
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by seat
         self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
@@ -142,7 +143,7 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, resources.workers + 1)
+        found = join_ray(resources.address, resources.workers + 1, self._heed)
         self._session = found["session_dir"] if resources.address == "local" else None
         try:
             self._setup_piece = self.put(self._setup)
@@ -442,11 +443,12 @@ class RayCluster:
         )
 
 
-def join_ray(address: str, cpus: int) -> dict[str, Any]:
+def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
-    not enough on a busy machine. Raises SpaceDistError if Ray cannot be started or reached.
+    not enough on a busy machine. While that lasts, `heed` is called, and may raise what ends it. Raises SpaceDistError
+    if Ray cannot be started or reached.
     """
     ours = address == "local"
     options: dict[str, Any] = (
@@ -455,12 +457,15 @@ def join_ray(address: str, cpus: int) -> dict[str, Any]:
     failures = 0
     while True:
         before = set(psutil.Process().children())
+        heed()
         try:
-            with _turn_to_start() if ours else contextlib.nullcontext():
+            with _turn_to_start(heed) if ours else contextlib.nullcontext():
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
                     **options,
                 )  # fmt: skip
+        except Interrupted:
+            raise
         except Exception as error:  # Ray raises bare ones, too
             failures += 1
             what = _first_line(error)
@@ -477,7 +482,7 @@ def join_ray(address: str, cpus: int) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _turn_to_start() -> Iterator[None]:
+def _turn_to_start(heed: Callable[[], None]) -> Iterator[None]:
     """Wait for other Rays of ours on this machine to be up: together, nine processes each, all would be too slow.
 
     An abstract socket is held, which is nobody's file, and free again whatever becomes of its holder.
@@ -489,6 +494,7 @@ def _turn_to_start() -> Iterator[None]:
                 turn.bind(f"\0space_dist starts a Ray for {os.getuid()}")
                 break
             except OSError:
+                heed()
                 time.sleep(_LOOK_SECONDS)
         yield
 

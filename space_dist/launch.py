@@ -75,7 +75,7 @@ def launch(
     """
     with begun(config, folder, resume=resume, stop=stop) as course:
         if not course.outcome.already_done:
-            with _cluster(config, course.setup, stop) as cluster:
+            with _cluster(course) as cluster:
                 course.training(cluster, observe).run()
     return course.finished()
 
@@ -94,11 +94,15 @@ class Course:
 
     def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
-        _stop_if_asked(self.writer, self.stop)
+        self.heed()
         return Training(
             self.config, self.setup, cluster, self.writer,
             status=self.status, stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
+
+    def heed(self) -> None:
+        """Raise Interrupted, before the first round, if it was asked to stop."""
+        _stop_if_asked(self.writer, self.stop)
 
     def finished(self) -> Outcome:
         """How it ended, once MLflow's mirror has what it can have."""
@@ -133,7 +137,7 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
-            _stop_if_asked(writer, stop)  # before Ray is started
+            course.heed()  # before Ray is started
             yield course
 
 
@@ -266,17 +270,17 @@ def policy_of(ledger: Ledger) -> Policy | Several:
 
 
 @contextlib.contextmanager
-def _cluster(config: RunConfig, setup: Setup, stop: StopRequests) -> Iterator[Cluster]:
-    if config.resources.workers == 0:
-        yield InProcess(config, setup)
+def _cluster(course: Course) -> Iterator[Cluster]:
+    if course.config.resources.workers == 0:
+        yield InProcess(course.config, course.setup)
         return
-    if config.resources.address == "local":
+    if course.config.resources.address == "local":
         private_ray()
     from space_dist.distributed import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
-        with stop.standing():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(config, setup))
+        with course.stop.standing():  # ray.init would replace SIGTERM's handler
+            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed))
         yield cluster
 
 

@@ -63,7 +63,7 @@ def conduct(
     after Ray has taken the signal handlers. Raises SpaceDistError if there is no room for one run, Interrupted if asked
     to stop.
     """
-    with _joined(address, manifest, max_parallel) as dashboard:
+    with _joined(address, manifest, max_parallel, stop_requested) as dashboard:
         reinstall()
         _await_nodes(nodes, stop_requested)
         size = _room_for(manifest, max_parallel)
@@ -80,10 +80,17 @@ def conduct(
 
 
 @contextlib.contextmanager
-def _joined(address: str, manifest: Manifest, max_parallel: int | None) -> Iterator[str]:
+def _joined(
+    address: str, manifest: Manifest, max_parallel: int | None, stop_requested: Callable[[], str | None]
+) -> Iterator[str]:  # fmt: skip
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
+
+    def heed() -> None:
+        if reason := stop_requested():
+            raise Interrupted(f"stopped before Ray was started ({reason})")
+
     # A run with rollout actors may have more processes than this machine has cores; they share them.
-    context = join_ray(address, max(_cores(), (max_parallel or 1) * manifest.cpus_per_run))
+    context = join_ray(address, max(_cores(), (max_parallel or 1) * manifest.cpus_per_run), heed)
     try:
         yield context.get("webui_url") or ""
     finally:
