@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_DEDUP_LOGS", "0")
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+from space_dist.place import RAY_DEFAULTS
+
+os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
 import psutil
 import ray

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import threading
@@ -14,6 +15,12 @@ from typing import Any
 from space_dist.errors import Interrupted
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+
+
+def _settle() -> None:
+    """Once the exit code is decided, Python takes its handlers down: what came then would end the process its way."""
+    for number in (signal.SIGTERM, signal.SIGUSR1):  # and not SIGINT, should the end hang
+        signal.signal(number, signal.SIG_IGN)
 
 
 class StopRequests:
@@ -33,7 +40,9 @@ class StopRequests:
 
     def install(self) -> None:
         """Set the handlers."""
-        self._installed = True
+        if not self._installed:
+            self._installed = True
+            atexit.register(_settle)  # before anybody else's, so it comes last
         for number in STOP_SIGNALS:
             signal.signal(number, self._on_signal)
 

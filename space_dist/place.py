@@ -10,6 +10,15 @@ from pathlib import Path
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError
 
+RAY_DEFAULTS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_DEDUP_LOGS": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    # Its handler lets ours hear SIGTERM, and has the process killed by SIGABRT 3 s later.
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",
+}
+"""What the environment says of Ray, unless the user has decided it, before Ray is imported."""
+
 
 def default_folder(config: RunConfig) -> Path:
     """`runs/<name>/s<seed>`, here."""

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from space_dist import config as configs
@@ -101,8 +102,9 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
 
 
 @pytest.mark.ray
-@pytest.mark.parametrize("progress", [0.0, 0.5, 1.0])
-def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float) -> None:
+@pytest.mark.parametrize("progress", [0.0, 0.5, 1.0, None])
+def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float | None) -> None:
+    """Once, at some moment; or (None) ever again, so that there is no moment at which it has not come."""
     process = subprocess.Popen(
         command(tmp_path, "resources.workers=1", "budget.steps=320000", "resources.grace_seconds=100"),
         cwd=ROOT,
@@ -113,8 +115,18 @@ def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float) 
         log, deadline = tmp_path / "run" / "log.txt", time.monotonic() + PATIENCE
         while not log.exists() and time.monotonic() < deadline:  # what is written just before Ray is started
             time.sleep(0.01)
-        time.sleep(4.0 * progress)
-        process.send_signal(signal.SIGTERM)
+        if progress is None:
+            watched = psutil.Process(process.pid)
+            while not any(child.name() == "gcs_server" for child in watched.children()):
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            while process.poll() is None:
+                assert time.monotonic() < deadline
+                process.send_signal(signal.SIGTERM)
+                time.sleep(0.01)
+        else:
+            time.sleep(4.0 * progress)
+            process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
