@@ -470,7 +470,8 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
             failures += 1
             what = _first_line(error)
             if not ours or failures == _STARTS:
-                raise SpaceDistError(f"Ray cannot be started or reached at {address!r}: {what}") from error
+                where = f"at {address!r} (resources.address, or --address)"
+                raise SpaceDistError(f"Ray cannot be started or reached {where}: {what}") from error
             log.warning("Ray did not start (%s); trying again", what)
             ray.shutdown()
             for process in set(psutil.Process().children()) - before:  # halves of a Ray
