@@ -148,7 +148,8 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
     monkeypatch.setattr(ray, "init", never)
     for address, starts in (("local", 5), ("127.0.0.1:1", 1)):  # somebody else's is not ours to start
         run = config(1, f"resources.address={address}")
-        said = rf"^Ray cannot be started or reached at '{address}' \(resources.address, or --address\): The current node timed out during startup.$"
+        where = rf"at '{address}' \(resources.address, or --address\)"
+        said = f"^Ray cannot be started or reached {where}: The current node timed out during startup.$"
         with pytest.raises(SpaceDistError, match=said), cluster_class(run, _setup(run)):
             pass
         assert begun == [address] * starts
