@@ -19,10 +19,8 @@ from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
-RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
-
-
 CONFIG = ROOT / "configs/pointmass_space.yaml"
+RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
 
 
 def settings(learner: str) -> list[str]:
@@ -70,6 +68,13 @@ def test_the_number_of_workers_changes_no_byte(reference: tuple[str, Path], work
     learner, folder = reference
     config = configs.load(CONFIG, [*settings(learner), f"resources.workers={workers}"])
     launch(config, tmp_path / "run", resume=False, stop=StopRequests())
+    assert results(tmp_path / "run") == results(folder)
+
+
+@pytest.mark.ray
+def test_the_command_with_a_ray_of_its_own_changes_no_byte(reference: tuple[str, Path], tmp_path: Path) -> None:
+    learner, folder = reference
+    run(train(tmp_path / "run", learner, workers=4))
     assert results(tmp_path / "run") == results(folder)
 
 

@@ -162,12 +162,9 @@ def _is_grid(path: Path) -> bool:
 
 def _grid(path: Path, root: Path | None) -> Grid:
     from space_dist.manifest import find_grid
+    from space_dist.place import workplace
 
-    if root is None and path.suffix in _YAML:  # only then, for this imports torch
-        from space_dist.place import workplace
-
-        root = workplace() / "runs"
-    return find_grid(path, root or Path())
+    return find_grid(path, workplace() / "runs" if root is None else root)
 
 
 def print_report(result: Report, to: Console) -> None:
