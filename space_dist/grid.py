@@ -26,7 +26,7 @@ from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedEr
 from space_dist.ledger import Lock
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.provenance import code_digest
-from space_dist.standing import Attempts, Ended, Standing, may_retry, standing_of, standings, unheard
+from space_dist.standing import Attempts, Ended, Standing, concluded, may_retry, standing_of, standings, unheard
 
 log = logging.getLogger("space_dist")
 
@@ -190,7 +190,7 @@ class Conductor:
             self._elsewhere[run.key] = run
         else:
             if not standing.told:  # its supervisor died in between
-                Attempts(standing.ledger).end(standing.attempts, Ended(None))
+                concluded(standing.ledger, standing.attempts)
             self._overview.done += 1
 
     def _end_if_abandoned(self, run: Run) -> None:

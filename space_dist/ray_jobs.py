@@ -34,7 +34,7 @@ from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
-from space_dist.standing import Attempts, Cause, Ended, Standing, is_done
+from space_dist.standing import Attempts, Cause, Ended, Standing, concluded
 from space_dist.supervisor import Turn, ray_answers
 
 log = logging.getLogger("space_dist")
@@ -254,19 +254,15 @@ class Jobs:
 
     def _how(self, run: Run, attempt: int, details: JobDetails | None) -> Ended | None:
         """How a job's attempt ended: what its supervisor wrote; if it was lost, what Ray says."""
-        attempts = Attempts(self._grid.ledger(run))
-        history = attempts.history()
-        if history.begun >= attempt and history.last is not None:
-            return history.last
-        if is_done(self._grid.ledger(run)) and history.begun >= attempt:
-            attempts.end(attempt, Ended(None))  # its supervisor was killed before it could
-            return Ended(None)
+        ledger = self._grid.ledger(run)
+        if (found := concluded(ledger, attempt)) is not None:
+            return found
         if details is not None and details.status == JobStatus.SUCCEEDED:
             return None  # somebody else is working on the run
         message = (details.message if details is not None else None) or "its job is gone"
         node = any(word in message.lower() for word in ("node", "head", "unexpected", "supervisor actor"))
         lost = Ended(Cause.NODE_LOST if node else Cause.KILLED, message.splitlines()[0][:500])
-        attempts.end(attempt, lost)
+        Attempts(ledger).end(attempt, lost)
         return lost
 
     def _end_if_silent(self, job: str, run: Run, attempt: int) -> None:

@@ -32,7 +32,7 @@ from ray.exceptions import RayActorError, RayError
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import Attempts, Cause, Ended, is_done
+from space_dist.standing import Attempts, Cause, Ended, concluded
 from space_dist.supervisor import STOPPED_SECONDS, Task, Turn, ray_answers
 
 log = logging.getLogger("space_dist")
@@ -221,14 +221,11 @@ class Pool:
         """Those that are done are done; nobody but us can say how the others ended."""
         ended: list[tuple[Run, Ended | None]] = []
         for run, attempt in turns:
-            attempts = Attempts(self._grid.ledger(run))
-            history = attempts.history()
-            if history.begun >= attempt and history.last is not None:  # its supervisor has still said so
-                ended.append((run, history.last))
-                continue
-            done = Ended(None) if is_done(self._grid.ledger(run)) else lost
-            attempts.end(attempt, done)
-            ended.append((run, done))
+            ledger = self._grid.ledger(run)
+            if (how := concluded(ledger, attempt)) is None:
+                how = lost
+                Attempts(ledger).end(attempt, lost)
+            ended.append((run, how))
         return ended
 
     def _listen(self, slot: _Slot) -> None:

@@ -251,6 +251,23 @@ def is_done(ledger: Ledger) -> bool:
     return False
 
 
+def concluded(ledger: Ledger, attempt: int) -> Ended | None:
+    """How an attempt ended whose supervisor is gone: as it wrote, or well, if its run is done; None if it was lost.
+
+    The end of a done run whose supervisor was killed before it could write it is written here, once.
+    """
+    attempts = Attempts(ledger)
+    history = attempts.history()
+    begun = history.begun >= attempt
+    if begun and history.last is not None:
+        return history.last
+    if not is_done(ledger):
+        return None
+    if begun:
+        attempts.end(attempt, Ended(None))
+    return Ended(None)
+
+
 def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:
     """Whether a run that ended so may be tried again. `ends` counts the ends by cause, this one included if known."""
     if cause is Cause.STOPPED:

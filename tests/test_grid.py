@@ -27,7 +27,7 @@ from space_dist.ledger import METRICS, Lock, Row
 from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
 from space_dist.planning import plan
 from space_dist.provenance import source_digest
-from space_dist.standing import Attempts, Cause, Ended, exit_code, last_lines, standing_of, standings
+from space_dist.standing import Attempts, Cause, Ended, concluded, exit_code, last_lines, standing_of, standings
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
 from tests.test_report import continue_run, start_run
@@ -596,6 +596,23 @@ def test_a_done_run_whose_supervisor_died_before_it_said_so_has_its_end_written_
         assert conduct().started == []
         assert [row["event"] for row in attempts.rows()] == ["begin", "end"]
     assert attempts.history().last == Ended(None)
+
+
+def test_what_became_of_an_attempt_is_as_written_or_done_or_unknown(supervised: Supervised, tmp_path: Path) -> None:
+    grid, _, run = faulty(tmp_path, "none")
+    ledger, attempts = grid.ledger(run), Attempts(grid.ledger(run))
+    attempts.begin(1, {})
+    assert concluded(ledger, 1) is None
+    attempts.end(1, Ended(Cause.KILLED, "by a hand"))
+    assert concluded(ledger, 1) == Ended(Cause.KILLED, "by a hand")
+    assert concluded(ledger, 2) is None  # it never began
+    assert supervised.attempt(grid, run, 2)["cause"] is None
+    rows = attempts.rows()
+    assert concluded(ledger, 2) == concluded(ledger, 3) == Ended(None)  # somebody else's is not written twice
+    assert attempts.rows() == rows
+    attempts.begin(3, {})
+    assert [concluded(ledger, 3), concluded(ledger, 3)] == [Ended(None)] * 2
+    assert [row["event"] for row in attempts.rows()[len(rows) :]] == ["begin", "end"]
 
 
 def test_the_conductor_retries_by_cause_and_never_starts_more_than_fits(tmp_path: Path) -> None:
