@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 import io
+import itertools
 import json
 import logging
 import subprocess
@@ -19,13 +21,15 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
+from space_dist.envs import BULLET_IDS
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError, about
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
-from space_dist.learner import refuse_device
+from space_dist.learner import refuse_device, torch_probes
 from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
 from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
@@ -133,9 +137,11 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
-                    "resumed on another CPU model, or with other code or library versions: results are valid, but not "
+                    "resumed with another arithmetic, other code or library versions: results are valid, but not "
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
+            for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
+                log.warning("%s", remark)
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
             course.heed()  # before Ray is started
             yield course
@@ -153,7 +159,7 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
 def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
     ledger = writer.ledger
-    now, here = time.time(), fingerprint()
+    now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config))
     status = Status(
         state="running", name=config.name, seed=config.seed, steps=0, budget_steps=config.budget.steps, round=0,
         started_at=now, updated_at=now, fingerprint=here,
@@ -177,6 +183,19 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
     ledger.stop_file.unlink(missing_ok=True)
     writer.set_status(status)
     return status
+
+
+def _also_decide(config: RunConfig) -> list[str]:
+    """The distributions whose arithmetic this run uses, besides those that every run does."""
+    bullet = config.env.id in BULLET_IDS
+    return [*(["scikit-learn"] if config.curriculum.kind == "alp_gmm" else []), *(["pybullet"] if bullet else [])]
+
+
+@functools.cache
+def arithmetic_digest() -> str:
+    """`arithmetic.digest` of all that a run computes with: it is what bits depend on, instead of the CPU's name."""
+    probes = (arithmetic.numpy_probes(), arithmetic.scipy_probes(), torch_probes())
+    return arithmetic.digest(itertools.chain(*probes))
 
 
 def _status_before(ledger: Ledger) -> Status | None:

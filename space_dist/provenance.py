@@ -1,33 +1,29 @@
-"""What results depend on besides config and seed: this code, a user's own, the libraries, and the CPU."""
+"""What results depend on besides config and seed: this code, a user's own, the libraries, and the arithmetic."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import importlib.metadata
 import importlib.util
-import platform
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 
 from space_dist.errors import ConfigError
 
-_BITS_DEPEND_ON = ("numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "space-dist")
+_BITS_DEPEND_ON = ("numpy", "scipy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium")
 _MAX_SOURCES = 5_000  # files of a user's package
 _DIGITS = 16
 
 
-def fingerprint() -> dict[str, str]:
-    """What bit-equality is promised for: the CPU's model, and the versions of what computes."""
-    model = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    versions = {name: importlib.metadata.version(name) for name in _BITS_DEPEND_ON}
-    return {"cpu": model, "python": platform.python_version(), "code": code_digest(), **versions}
+def fingerprint(arithmetic: str, also: Iterable[str] = ()) -> dict[str, str]:
+    """What bit-equality is promised for: what the arithmetic computes, this code, and versions of what else decides.
+
+    arithmetic: `arithmetic.digest` of everything.  also: distributions that this run uses besides those of every run.
+    """
+    versions = {name: importlib.metadata.version(name) for name in (*_BITS_DEPEND_ON, *also)}
+    return {"arithmetic": arithmetic, "code": code_digest(), **versions}
 
 
 @functools.cache

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import space_dist  # noqa: F401 # isort: skip - its settings come before NumPy is loaded
+
 import pytest
 from hypothesis import settings
 

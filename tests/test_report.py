@@ -365,7 +365,7 @@ def test_runs_of_other_code_are_named(tmp_path: Path) -> None:
         writer.set_status(dataclasses.replace(writer.status, fingerprint=fingerprint, fingerprint_changed=True))
     remarks = build_report(find_ledgers([tmp_path]), tmp_path / "out").remarks
     assert "space: its runs differ in torch: 2.0, 2.1." in remarks
-    assert any("resumed with another CPU model or other library versions: seed 1" in remark for remark in remarks)
+    assert any("resumed with another arithmetic or other library versions: seed 1" in remark for remark in remarks)
 
 
 def test_no_runs_and_nowhere_to_write_are_refused(tmp_path: Path) -> None:

@@ -33,6 +33,8 @@ BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/BallCatching-v0": BatchedBallCatching,
     "space_dist/Maze-v0": BatchedMaze,
 }
+BULLET_IDS = frozenset({"space_dist/AntGoal-v0", "space_dist/BallCatching-v0"})
+"""Those whose physics are PyBullet's."""
 
 
 def make_single(env_id: str, **kwargs: Any) -> SingleEnv:

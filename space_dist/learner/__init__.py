@@ -27,6 +27,7 @@ from space_dist.config import (
 )
 from space_dist.errors import ConfigError
 from space_dist.learner.coupled import CoupledLearner
+from space_dist.learner.elementary import torch_probes  # and replaces kernels of torch
 from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
@@ -112,4 +113,5 @@ __all__ = [
     "refuse_population",
     "refuse_spaces",
     "stack_key",
+    "torch_probes",
 ]

@@ -364,7 +364,7 @@ def fingerprint_remarks(cells: Sequence[CellRuns], manifest: Manifest) -> list[s
             for value, found in values.items() if value != usual
         ]  # fmt: skip
     if moved := [(cell, run) for cell, run in runs if run.status.fingerprint_changed]:
-        lines.append(f"Resumed with another CPU model or other library versions, and counted: {named(moved)}.")
+        lines.append(f"Resumed with another arithmetic or other library versions, and counted: {named(moved)}.")
     return lines
 
 

@@ -82,7 +82,7 @@ def remarks(configuration: Configuration) -> list[str]:
     for field, values in fingerprint_differences(configuration.runs).items():
         lines.append(f"{label}: its runs differ in {field}: {', '.join(values)}.")
     if moved := [run for run in configuration.runs if run.status.fingerprint_changed]:
-        lines.append(f"{label}: resumed with another CPU model or other library versions: {_seeds(moved)}.")
+        lines.append(f"{label}: resumed with another arithmetic or other library versions: {_seeds(moved)}.")
     return lines
 
 

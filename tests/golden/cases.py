@@ -1,0 +1,121 @@
+"""Short runs of every learner, engine, environment and curriculum, whose files must have the same bits everywhere."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import hashlib
+from pathlib import Path
+
+from space_dist import config as configs
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
+from space_dist.ledger import CURRICULUM, METRICS
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+DIGESTS = Path(__file__).with_name("digests.json")
+FILES = (METRICS, CURRICULUM, "model.npz")
+_TRAIN, _TEST = 12, 4  # instances: enough to choose from, and cheap to emulate
+
+_SHORT = [
+    "budget.steps=1536", "rollout.slots=1", "learner.n_steps=512", "evaluation.every_steps=100000", "tracking.uri=null",
+    "resources.workers=0",
+]  # fmt: skip
+_PPO = [*_SHORT, "learner.n_epochs=2"]
+_LEAN = [*_PPO, "learner.update=lean"]
+_TRPO = "learner={kind: trpo, n_steps: 512, n_critic_updates: 2}"
+_CONTINUOUS = "net_arch: [32, 32], batch_size: 32, learning_starts: 256, gradient_steps_per_step: 0.05"
+
+
+_COLUMN = "difficulty"  # what `manual` goes by; in the training instances of its case alone
+
+
+def _curriculum(settings: str) -> str:
+    return f"curriculum={{{settings}}}"
+
+
+CASES: dict[str, tuple[str, list[str]]] = {
+    # learners and engines
+    "ppo": ("pointmass_space", _PPO),
+    "ppo relu, normalised": ("pointmass_space", [
+        *_PPO, "learner.activation=relu", "learner.normalize_observations=true", "learner.normalize_rewards=true",
+        "budget.steps=2048",
+    ]),
+    "ppo lean": ("pointmass_space", [*_LEAN, "learner.ent_coef=0.01", "learner.target_kl=0.02"]),
+    "ppo population": ("pointmass_space", [*_PPO, "engine=population"]),
+    "ppo shared curriculum": ("pointmass_space", [
+        *_PPO, "engine=population", "curriculum.aggregate=population", "curriculum.policies=2",
+    ]),
+    "ppo overlap": ("pointmass_space", [*_PPO, "rollout.overlap=true"]),
+    "trpo": ("pointmass_space", [*_SHORT, _TRPO]),
+    "trpo population": ("pointmass_space", [*_SHORT, _TRPO, "engine=population"]),
+    "a2c": ("pointmass_space", [*_SHORT, "learner={kind: a2c, n_steps: 512}"]),
+    "dqn": ("cartpole_dqn_space", [
+        "budget.steps=1000", "budget.episodes=20", "learner.learning_starts=200", "learner.net_arch=[32, 32]",
+        "tracking.uri=null", "evaluation.episodes=1", "resources.workers=0",
+    ]),
+    "sac": ("pointmass_space", [*_SHORT, f"learner={{kind: sac, n_steps: 512, {_CONTINUOUS}}}"]),
+    "td3": ("pointmass_space", [*_SHORT, f"learner={{kind: td3, n_steps: 512, {_CONTINUOUS}}}"]),
+    # environments
+    "antgoal": ("antgoal_space", [*_PPO, "env.kwargs.horizon=50", "rollout.shards=2", "budget.steps=1024"]),
+    "ballcatching": ("ballcatching_space", [
+        *_PPO, "rollout.shards=2", "budget.steps=1024", "learner.net_arch=[32, 32]",
+    ]),
+    "maze": ("maze_space", [
+        *_PPO, "env.kwargs.horizon=64", "learner.batch_size=64", "learner.net_arch=[32, 32]",
+        "learner.update=stock",
+    ]),
+    # curricula
+    "cspace": ("pointmass_space", [*_LEAN, _curriculum("kind: cspace, kappa: 2")]),
+    "round robin": ("pointmass_round_robin", _LEAN),
+    "random growth": ("pointmass_space", [*_LEAN, _curriculum("kind: random_growth, kappa: 2")]),
+    "fixed": ("pointmass_space", [*_LEAN, _curriculum("kind: fixed, ids: [0, 2]")]),
+    "manual": ("pointmass_space", [*_LEAN, _curriculum(f"kind: manual, column: {_COLUMN}, kappa: 2")]),
+    "uniform": ("curricula/pointmass_uniform", _LEAN),
+    "spdrl": ("curricula/pointmass_spdrl", [
+        *_LEAN, "budget.steps=2048", "curriculum.warm_up=1", "curriculum.offset=1",
+    ]),
+    "vds": ("curricula/pointmass_vds", [*_LEAN, "curriculum.n_batches=4", "curriculum.batch_size=100"]),
+    "alp_gmm": ("curricula/pointmass_alp_gmm", [
+        *_LEAN, "budget.steps=3072", "curriculum.fit_rate=12", "curriculum.components=3",
+    ]),
+    "plr": ("curricula/pointmass_plr", _LEAN),
+    "learnability": ("curricula/pointmass_learnability", [
+        *_LEAN, "budget.steps=6144", "curriculum.every=1", "curriculum.episodes=2", "curriculum.top=4",
+    ]),
+}  # fmt: skip
+"""Name -> (shipped config, settings)."""
+
+
+@functools.cache
+def _instances(file: Path, count: int) -> list[list[str]]:
+    with file.open(newline="") as stream:
+        return list(csv.reader(stream))[: count + 1]
+
+
+def config_of(name: str, folder: Path, also: tuple[str, ...] = ()) -> configs.RunConfig:
+    """A case's config, on the first instances of the shipped sets, which are copied into `folder`."""
+    base, settings = CASES[name]
+    file = ROOT / "configs" / f"{base}.yaml"
+    shipped = configs.load(file).instances
+    made = []
+    for split, source, count in (("train", shipped.train, _TRAIN), ("test", shipped.test, _TEST)):
+        target, rows = folder / f"{split}.csv", _instances(source, count)
+        if (name, split) == ("manual", "train"):
+            rows = [[*row, _COLUMN if row is rows[0] else str(5 * number % 7)] for number, row in enumerate(rows)]
+        with target.open("w", newline="") as stream:
+            csv.writer(stream).writerows(rows)
+        made.append(f"instances.{split}={target}")
+    return configs.load(file, [*settings, *made, *also])
+
+
+def digests_of(folder: Path) -> dict[str, str]:
+    """`(16 hex digits)` of each file of a finished run that holds results."""
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest()[:16] for name in FILES}
+
+
+def run(name: str, folder: Path) -> dict[str, str]:
+    """Run a case in `folder`, in this process; the digests of what it wrote."""
+    folder.mkdir(parents=True)
+    launch(config_of(name, folder), folder / "run", resume=False, stop=StopRequests())
+    return digests_of(folder / "run")
