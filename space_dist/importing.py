@@ -82,8 +82,8 @@ def why_refused(import_path: str) -> str | None:
     if owner == _OURS:
         return f"{module!r} is a module of space_dist itself, whose environments and policies are named by their ids"
     return (
-        f"{module!r} is a module of {owner}; an import path names a module of your own. (If this one is yours, give "
-        "it another name: a library's comes first)"
+        f"{module!r} is a module of {owner}, and an import path names a module of your own (which needs another name "
+        "if this one is yours: a library's comes first)"
     )
 
 
