@@ -105,7 +105,7 @@ def test_the_tests_own_environments_pass(make: str) -> None:
 
 
 class Long(Honest):
-    """As long as what the checker compares, and longer: it never ends by itself before."""
+    """It never ends by itself."""
 
     observation_space: Any = spaces.Box(-300.0, 300.0, shape=(1,), dtype=np.float32)
 
@@ -115,7 +115,7 @@ class Long(Honest):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         observation, reward, *_, info = super().step(action)
-        return observation, reward, False, self.time >= self.horizon, info
+        return observation, reward, False, False, info
 
 
 @pytest.mark.parametrize("horizon", [2, COMPARED_STEPS - 1, COMPARED_STEPS, COMPARED_STEPS + 1])
