@@ -20,6 +20,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent
 
 from space_dist.errors import ConfigError, nearest
+from space_dist.importing import why_refused
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -40,6 +41,13 @@ class Section(BaseModel):
     )
 
 
+def _refuse_library(value: str) -> str:
+    """An id or import path, unless a library's: to read a stranger's config must call no function of a library."""
+    if ":" in value and (reason := why_refused(value)) is not None:
+        raise ValueError(reason)
+    return value
+
+
 class EnvConfig(Section):
     """The environment."""
 
@@ -51,6 +59,11 @@ class EnvConfig(Section):
     context_visible: bool = True
     """Whether observations end with the context, scaled from its bounds to [-1, 1]. The released SPaCE code hides it;
     value-based curricula need it where all episodes start alike."""
+
+    @field_validator("id")
+    @classmethod
+    def _no_library(cls, value: str) -> str:
+        return _refuse_library(value)
 
 
 class InstancesConfig(Section):
@@ -426,7 +439,7 @@ class _Learner(Section):
             raise ValueError(
                 f"not known{nearest(value, known)} Allowed: {', '.join(known)}, or an import path with a colon"
             )
-        return value
+        return _refuse_library(value)
 
 
 class _OnPolicy(_Learner):

@@ -31,6 +31,7 @@ os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 import psutil
 import ray
 from ray.exceptions import RayError, RayTaskError
+from ray.job_config import JobConfig
 from ray.util.placement_group import PlacementGroup, placement_group, placement_group_table, remove_placement_group
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
@@ -38,6 +39,7 @@ from threadpoolctl import threadpool_limits
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.importing import folders_of_user, look_in
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
@@ -69,9 +71,13 @@ class _Timed:
 
 
 class RolloutActor(_Timed, Worker):
-    """A `Worker` in a process of its own, with one thread for its arithmetic."""
+    """A `Worker` in a process of its own, with one thread for its arithmetic.
 
-    def __init__(self, setup: Setup) -> None:
+    folders: where a user's own modules may be found.
+    """
+
+    def __init__(self, setup: Setup, folders: Sequence[str]) -> None:
+        look_in(folders)
         threadpool_limits(limits=1)
         super().__init__(setup)
 
@@ -353,7 +359,7 @@ class RayCluster:
             self._actors[seat] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup)
                 if seat == _CENTRAL
-                else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup)
+                else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
             self._starting[seat] = (self._actors[seat].ready.remote(), time.monotonic())
 
@@ -443,6 +449,14 @@ class RayCluster:
         )
 
 
+class _Driver(JobConfig):
+    """What Ray tells workers of their driver, but for its folders, where they would look before anywhere else."""
+
+    def _serialize(self) -> str:
+        self._py_driver_sys_path: list[str] = []
+        return super()._serialize()
+
+
 def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
@@ -462,7 +476,7 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
             with _turn_to_start(heed) if ours else contextlib.nullcontext():
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
-                    **options,
+                    job_config=_Driver(), **options,
                 )  # fmt: skip
         except Interrupted:
             raise

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Protocol
 
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
+from space_dist.importing import PYTHON
 from space_dist.ledger import Lock
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.provenance import code_digest
@@ -339,7 +340,7 @@ def _start_pusher(grid: Grid, manifest: Manifest) -> subprocess.Popen[bytes] | N
     """One process pushes for all runs, so that a store has one writer, and a slow server costs no training time."""
     if manifest.tracking.uri is None:
         return None
-    command = [sys.executable, "-m", "space_dist.cli", "sync", "--follow", "--", str(grid.folder)]
+    command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(grid.folder)]
     with grid.tracking_log.open("ab") as output:
         return subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True

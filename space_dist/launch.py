@@ -10,7 +10,6 @@ import itertools
 import json
 import logging
 import subprocess
-import sys
 import time
 import traceback
 import zipfile
@@ -27,6 +26,7 @@ from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError, about
+from space_dist.importing import PYTHON
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_device, torch_probes
@@ -357,7 +357,7 @@ def _start_pusher(config: RunConfig, ledger: Ledger) -> subprocess.Popen[bytes] 
     """MLflow's mirror is kept by a process of its own: a slow or dead server costs training nothing."""
     if config.tracking.uri is None or not config.tracking.live:
         return None
-    command = [sys.executable, "-m", "space_dist.cli", "sync", "--follow", "--", str(ledger.folder)]
+    command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(ledger.folder)]
     try:
         with (ledger.folder / "tracking.log").open("ab") as output:
             # A session of its own: Ctrl-C is for the run; the pusher ends by itself once the run has.

@@ -14,7 +14,6 @@ import math
 import os
 import shlex
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +31,7 @@ from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 from space_dist.distributed import join_ray, remove_session
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
+from space_dist.importing import PYTHON
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
 from space_dist.standing import Attempts, Cause, Ended, Standing, concluded
@@ -210,7 +210,7 @@ class Jobs:
             all_turns = [Turn(run.cell.id, run.seed, attempt), *(Turn(one.cell.id, one.seed, number)
                                                                  for one, number in turns[1:])]  # fmt: skip
             command = [
-                sys.executable, "-m", "space_dist.cli", "grid", "work", str(self._grid.folder), *map(str, all_turns),
+                *PYTHON, "-m", "space_dist.cli", "grid", "work", str(self._grid.folder), *map(str, all_turns),
                 "--nonce", self._nonce.text, "--job", job,
             ]  # fmt: skip
             grace = self._manifest.resources.grace_seconds
@@ -326,8 +326,8 @@ class Remote:
         if alive is not None and alive.status in _LIVE:
             return str(alive.submission_id)
         before = [job for job in self._list() if (job.metadata or {}).get("conducts") == str(self._folder)]
-        command = [python, "-m", "space_dist.cli", "grid", "run", "manifest.json", "--root", str(self._folder.parent),
-                   "--address", "auto", "--mode", mode]  # fmt: skip
+        command = [python, *PYTHON[1:], "-m", "space_dist.cli", "grid", "run", "manifest.json",
+                   "--root", str(self._folder.parent), "--address", "auto", "--mode", mode]  # fmt: skip
         if max_in_flight is not None:
             command += ["--max-parallel", str(max_in_flight)]
         folder = hashlib.sha256(str(self._folder).encode()).hexdigest()[:8]  # grids of one name in several roots

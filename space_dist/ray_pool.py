@@ -13,7 +13,6 @@ import logging
 import os
 import secrets
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from space_dist.errors import LedgerError, SpaceDistError
+from space_dist.importing import PYTHON
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.standing import Attempts, Cause, Ended, concluded
@@ -54,7 +54,7 @@ class PoolWorker:
         self._stopped_since: float | None = None
 
     def _start(self) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "space_dist.supervisor"]
+        command = [*PYTHON, "-m", "space_dist.supervisor"]
         # Nothing of this actor's own identity: runs that join Ray join it as drivers.
         environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
         with (Path(self._folder) / "pool.log").open("ab") as errors:

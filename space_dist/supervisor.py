@@ -36,6 +36,7 @@ import psutil
 
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
+from space_dist.importing import look_here_too
 from space_dist.interrupts import StopRequests
 from space_dist.manifest import Grid, Manifest, Run, RunResources
 from space_dist.standing import Attempts, Cause, Ended, last_lines, slurm_job
@@ -450,7 +451,7 @@ class _Manager:
 def main() -> None:
     """Attempt every task that comes, one after another."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever manages us
-    sys.path.append(str(Path.cwd()))  # import paths in configs may name the user's own modules
+    look_here_too()  # import paths in configs may name the user's own modules
     results = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is not a result
     preload()

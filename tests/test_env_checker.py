@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from space_dist import cli
 from space_dist.envs import BATCHED, make_batched
-from space_dist.envs.checker import check
+from space_dist.envs.checker import COMPARED_STEPS, check
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
+from tests.faulty_env import Honest
 
 FAULTS = {
     "IgnoresContexts": "contexts are ignored: another context changes nothing",
@@ -98,6 +102,52 @@ def test_our_own_environments_pass(env_id: str) -> None:
 @pytest.mark.parametrize("make", ["make", "make_discrete", "make_image", "make_dict", "make_scaled"])
 def test_the_tests_own_environments_pass(make: str) -> None:
     assert check(f"tests.tiny_env:{make}").faults == []
+
+
+class Long(Honest):
+    """It never ends by itself."""
+
+    observation_space: Any = spaces.Box(-300.0, 300.0, shape=(1,), dtype=np.float32)
+
+    def __init__(self, horizon: int) -> None:
+        super().__init__()
+        self.horizon = horizon
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, *_, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+@pytest.mark.parametrize("horizon", [2, COMPARED_STEPS - 1, COMPARED_STEPS, COMPARED_STEPS + 1])
+def test_no_horizon_is_too_long_for_it(horizon: int) -> None:
+    findings = check(f"{__name__}:Long", {"horizon": horizon})
+    assert (findings.faults, findings.horizon) == ([], horizon)
+
+
+class OverAtTheEnd(Long):
+    def observe(self) -> Any:
+        return np.array([np.nan if self.time == self.horizon else self.x], dtype=np.float32)
+
+
+def test_the_last_observation_is_looked_at() -> None:
+    (fault,) = check(f"{__name__}:OverAtTheEnd", {"horizon": COMPARED_STEPS}).faults
+    assert fault == f"the observation at step {COMPARED_STEPS} holds NaN"
+
+
+class Rounded(Honest):
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = spaces.Box(np.array([-10.1]), np.array([10.1]), dtype=np.float32)
+        warnings.warn("it is wet", stacklevel=1)
+
+
+def test_rounded_bounds_are_told_once() -> None:
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        findings = check(f"{__name__}:Rounded")
+    assert findings.faults == []
+    assert len([note for note in findings.notes if "rounded to its float32" in note]) == 1
+    assert [str(one.message) for one in warned] == ["it is wet"]  # what else it says is said, and once, too
 
 
 def test_contexts_can_be_given() -> None:

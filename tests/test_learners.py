@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3.sac.policies import SACPolicy  # noqa: F401 - named by import path
 
 from space_dist import config as configs
 from space_dist.cluster import make_curriculum
@@ -581,7 +582,7 @@ def test_policies_through_torch_are_stable_baselines3s(name: str, tmp_path: Path
         ("CnnPolicy", spaces.Box(0, 255, shape=(36, 36, 1), dtype=np.uint8)),  # channels last
         ("CnnPolicy", spaces.Box(0, 255, shape=(1, 20, 20), dtype=np.uint8)),
         ("MultiInputPolicy", spaces.Box(-1.0, 1.0, shape=(2,))),
-        ("stable_baselines3.sac.policies:SACPolicy", spaces.Box(-1.0, 1.0, shape=(2,))),  # another learner's
+        (f"{__name__}:SACPolicy", spaces.Box(-1.0, 1.0, shape=(2,))),  # another learner's
     ],
     ids=["flat", "channels last", "too small", "no dictionary", "other learner"],
 )

@@ -176,10 +176,24 @@ def test_the_commented_profile_names_every_field() -> None:
         (["extra=[--partition=x]"], ["--partition has a field of its own: partition"]),
         (["extra=[--wrap=ls]"], ["--wrap", "cannot be set here"]),
         (["extra=[-p x]"], ["no long option of sbatch"]),
+        (["extra=[-a0-9999]"], ["no long option of sbatch"]),
+        (["extra=[--arra=0-9999]"], ["--arra, which may be short for --array, is what these scripts are made of"]),
+        (["extra=[--a=0-9999]"], ["extra", "--a, which may be short for --array"]),
+        (["extra=[--wra=id]"], ["--wra, which may be short for --wrap"]),
+        (["extra=[--test]"], ["--test, which may be short for --test-only"]),
+        (["extra=[--chdi=/]"], ["--chdi, which may be short for --chdir"]),
+        (["extra=[--no-req]"], ["--no-req, which may be short for --no-requeue"]),
+        (["extra=[--parti=x]"], ["--parti, which may be short for --partition, has a field of its own: partition"]),
+        (["extra=[--mail-u=x]"], ["has a field of its own: mail_user"]),
         (["mail_type=[SOMETIMES]"], ["mail_type", "SOMETIMES"]),
         (["partition=-x"], ["partition", "must not begin with a hyphen"]),
         (["env={A-B: x}"], ["env", "no name of an environment variable"]),
         (["env={RAY_AUTH_TOKEN: x}"], ["RAY_AUTH_TOKEN", "set by SLURM or by these scripts"]),
+        (["env={scratch: /home/me}"], ["env: scratch is set by SLURM or by these scripts"]),
+        (["env={UID: '0'}"], ["env: UID is bash's own"]),
+        (["env={BASH_ENV: /x}"], ["BASH_ENV is bash's own"]),
+        (["env={POSIXLY_CORRECT: '1'}"], ["POSIXLY_CORRECT is bash's own"]),
+        (["env={PATH: /opt/bin}"], ["PATH", "prologue", "export PATH=/opt/bin:$PATH"]),
         (["temp=relative"], ["temp", "relative"]),
         (["job_name=../../x"], ["job_name", "../../x"]),
         (["throttle=0"], ["throttle", "0"]),
@@ -227,6 +241,75 @@ def test_templates_can_be_replaced_and_their_faults_are_named(manifest: Manifest
     (tmp_path / "finish.sh.j2").write_text("{{ no_such_value }}")
     with pytest.raises(ConfigError, match="no_such_value"):
         render(made, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ('{% include "finish.sh.j2" %}', r"finish\.sh\.j2, line 1: it includes itself"),
+        ('{% include "a.sh.j2" %}', r"[ab]\.sh\.j2, line 1: it includes itself"),
+        ("\n{{ 1 / 0 }}", r"finish\.sh\.j2, line 2: ZeroDivisionError: division by zero"),
+        ("{{ temp + 1 }}", r"finish\.sh\.j2, line 1: TypeError"),
+        ("{{ 'x' * 10 ** 20 }}", r"finish\.sh\.j2, line 1"),
+        ("{{ lines() }}", "'lines' is undefined"),
+        ("{% for n in range(10 ** 9) %}{{ n }}{% endfor %}", r"finish\.sh\.j2, line 1: OverflowError"),
+        ("{{ temp.__class__.__mro__ }}", r"finish\.sh\.j2, line 1: access to attribute '__class__'"),
+        ('{% include "nowhere.j2" %}', r"template nowhere\.j2 is missing"),
+    ],
+)
+def test_a_templates_fault_is_a_sentence(content: str, said: str, manifest: Manifest, tmp_path: Path) -> None:
+    (tmp_path / "finish.sh.j2").write_text(content)
+    (tmp_path / "a.sh.j2").write_text('{% include "b.sh.j2" %}')
+    (tmp_path / "b.sh.j2").write_text('{% include "a.sh.j2" %}')
+    with pytest.raises(ConfigError, match=said):
+        render(Export(manifest, profile(), "array"), tmp_path)
+
+
+def test_a_template_that_is_no_text_is_a_sentence(manifest: Manifest, tmp_path: Path) -> None:
+    (tmp_path / "finish.sh.j2").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match=r"finish\.sh\.j2 cannot be read"):
+        render(Export(manifest, profile(), "array"), tmp_path)
+
+
+def test_no_variable_of_the_scripts_is_a_profiles_to_set(manifest: Manifest, tmp_path: Path) -> None:
+    """What bash itself says that a script assigns, by its own reading of it."""
+    for mode in MODES:
+        for name, text in render(Export(manifest, profile(), mode)).items():
+            if name == "README.md":
+                continue
+            words = re.sub(r"^ *#.*$", "", text, flags=re.MULTILINE).split()
+            assigned = {found[1] for word in words if (found := re.match(r"['(]?([A-Za-z_]\w*)\+?=", word))}
+            assert len(assigned) > 3, name
+            for variable in {*assigned, "nodes" if mode == "cluster" else "task"}:
+                with pytest.raises(ValueError, match=rf"{variable} is"):
+                    profile(env={variable: "x"})
+    (tmp_path / "finish.sh.j2").write_text("mine=1\n")
+    with pytest.raises(ConfigError, match=r"env: mine is a variable of the template .*finish\.sh\.j2"):
+        render(Export(manifest, profile(env={"mine": "x"}), "array"), tmp_path)
+    render(Export(manifest, profile(env={"mine": "x"}), "array"))
+
+
+def test_no_variable_of_bash_is_a_profiles_to_set() -> None:
+    """All that bash has in an empty environment, but for what programs read."""
+    told = subprocess.run(["bash", "--norc", "-c", "compgen -v"], env={}, capture_output=True, text=True, check=True)
+    variables = {*told.stdout.split()} - {"TERM", "SHELL"}
+    assert {"UID", "IFS", "PPID", "SHELLOPTS"} <= variables
+    for variable in variables:
+        with pytest.raises(ValueError, match=rf"{variable}"):
+            profile(env={variable: "x"})
+    assert profile(env={"LD_LIBRARY_PATH": "/a", "PYTHONPATH": "/b", "RAY_worker_niceness": "0"}).env
+
+
+def test_options_that_only_look_like_others_are_taken() -> None:
+    lines = (
+        "--wait-all-nodes=1",
+        "--ntasks-per-core=1",
+        "--time-min=5",
+        "--mem-bind=local",
+        "--gpus-per-node=1",
+        "--hint=x",
+    )
+    assert profile(extra=lines).extra == lines
 
 
 def test_export_freezes_the_grid_and_refuses_to_mix_two(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
@@ -407,6 +490,24 @@ def test_a_profile_line_is_one_line() -> None:
         for value in ("a\nb", "a\rb", "\x1b[2J", "a\0b", "a\u2028b"):
             with pytest.raises(ValueError, match="one line of printable characters"):
                 profile(**{name: [value], **({"apptainer": "x"} if name == "apptainer_options" else {})})
+
+
+def test_commands_of_the_readme_do_nothing_else_when_pasted(manifest: Manifest, tmp_path: Path) -> None:
+    canary, stand_ins = tmp_path / "canary", Stubs(tmp_path / "stubs")
+    for index, value in enumerate(one for one in HOSTILE[::3] if one.isprintable()):
+        root = Path("/nowhere") / value.replace("/", "_")
+        made = Export(manifest, profile(output=f"x{value}/%x.out"), MODES[index % 2], root)
+        folder = write(made, tmp_path / str(index))
+        blocks = re.findall(r"^```bash\n(.*?)^```", (folder / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+        assert len(blocks) == 3
+        pasted = folder / "pasted"
+        pasted.write_text("".join(blocks).replace("./submit.sh", ":"))
+        _, said = stand_ins.run(pasted, C=str(canary))
+        assert "syntax error" not in said, value
+        assert not canary.exists(), value
+        asked = [call[1:] for call in stand_ins.calls("space-dist")]
+        results = str(root / manifest.name)
+        assert asked == [["grid", "status", results], ["sync", results, "--uri", "URI"], ["grid", "stop", results]]
 
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")

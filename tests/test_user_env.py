@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit, TransformReward
 
 from space_dist import cli
 from space_dist.cli import runs
@@ -108,6 +109,22 @@ def test_an_environment_that_knows_no_end_gets_one() -> None:
         make(f"{__name__}:Timeless", horizon=0)
 
 
+def limited() -> gym.Env[Any, Any]:
+    env: gym.Env[Any, Any] = Timeless()
+    for limit in (9, 6, 8):
+        env = TimeLimit(env, limit)
+    return TransformReward(env, abs)
+
+
+def test_a_time_limit_is_a_horizon() -> None:
+    env = make(f"{__name__}:limited", 2)
+    assert env.horizon == 6  # of several the one that ends episodes
+    env.reset(np.arange(2), np.array([[0.1], [0.7]]), np.zeros(2, dtype=np.uint64))
+    ends = [env.step(np.array([1, 1])).truncated.tolist() for _ in range(6)]
+    assert ends == [[False] * 2] * 5 + [[True] * 2]
+    assert make(f"{__name__}:limited", 1, horizon=4).horizon == 4  # the config's word comes first
+
+
 class Measured(Honest):
     """Its own arguments: `horizon` is one of them."""
 
@@ -124,6 +141,10 @@ def test_arguments_reach_the_function_that_has_them() -> None:
         make(f"{__name__}:Measured", 1, horizon=5, sclae=2.0)
 
 
+def several() -> Any:
+    return gym.make_vec("CartPole-v1")
+
+
 def test_an_id_registered_with_gymnasium_works_if_it_knows_contexts() -> None:
     gym.register("tests/Honest-v0", entry_point=HONEST, max_episode_steps=9)
     try:
@@ -138,7 +159,7 @@ def test_an_id_registered_with_gymnasium_works_if_it_knows_contexts() -> None:
     with pytest.raises(ConfigError, match=r"CartPole-v1.*no `context_space`"):
         make("CartPole-v1")
     with pytest.raises(ConfigError, match="vector environment"):
-        make("gymnasium:make_vec", id="CartPole-v1")
+        make(f"{__name__}:several")
 
 
 def test_half_a_step_of_a_whole_number_is_refused() -> None:

@@ -6,7 +6,6 @@ from space_dist.cli.terminal import warn  # isort: skip - before anything heavy
 
 import os
 import sys
-from pathlib import Path
 
 import typer
 
@@ -16,6 +15,7 @@ from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
 from space_dist.cli.worlds import env_app, render
 from space_dist.errors import SpaceDistError
+from space_dist.importing import look_here_too
 
 app = typer.Typer(
     name="space-dist", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -32,7 +32,7 @@ app.add_typer(env_app, name="env")
 
 def main() -> None:
     """Run a command; every error that a user can cause ends it with one sentence and its exit code."""
-    sys.path.append(str(Path.cwd()))  # import paths in configs may name the user's own modules
+    look_here_too()  # import paths in configs may name the user's own modules
     try:
         app()
     except SpaceDistError as error:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import importlib
 import inspect
 import warnings
 from collections.abc import Callable, Mapping
@@ -24,6 +24,7 @@ from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError, nearest
+from space_dist.importing import load
 from space_dist.instances import ContextBounds, Distribution
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
@@ -174,22 +175,24 @@ def _find(env_id: str) -> Callable[..., Any]:
         return BATCHED[env_id]
     if env_id in gym.registry:  # somebody else's: made as Gymnasium makes it, TimeLimit included
         return lambda **kwargs: gym.make(env_id, disable_env_checker=True, **kwargs)
-    module_name, colon, name = env_id.partition(":")
+    module, colon, name = env_id.partition(":")
     if not colon:
         raise ConfigError(
             f"env.id {env_id!r} is not known{nearest(env_id, BATCHED)} Known: {', '.join(BATCHED)}, "
             "an id registered with Gymnasium, or an import path like my_package.my_module:make"
         )
-    try:
-        with warnings.catch_warnings():
-            if module_name.partition(".")[0] == "carl":  # warns of each of its suites that is not installed
-                warnings.simplefilter("ignore")
-            found = getattr(importlib.import_module(module_name), name, None)
-    except (Exception, SystemExit) as error:  # somebody else's module may raise anything
-        what = f"{type(error).__name__}: {str(error)[:200]}"
-        raise ConfigError(f"env.id {env_id!r}: cannot import {module_name!r}: {what}") from error
+    carl = module.partition(".")[0] == "carl"
+    # Only where needed: leaving `catch_warnings` has Python forget what it has warned of already.
+    with warnings.catch_warnings() if carl else contextlib.nullcontext():
+        if carl:  # warns of each of its suites that is not installed
+            warnings.simplefilter("ignore")
+        found: Any = load(env_id, "env.id", of_library=gym.Env)
+    if carl and not is_carl(found):
+        raise ConfigError(
+            f"env.id {env_id!r}: of CARL's modules a config names environments, like carl.envs:CARLCartPole"
+        )
     if not callable(found):
-        raise ConfigError(f"env.id {env_id!r}: {module_name!r} has no function {name!r}")
+        raise ConfigError(f"env.id {env_id!r}: {module!r} has no function {name!r}")
     made: Callable[..., Any] = functools.partial(CarlEnv, found) if is_carl(found) else found
     return made
 

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from space_dist.envs.interface import FloatArray, IntArray, Step
@@ -24,7 +25,7 @@ class BatchedSingles:
     Each needs a `context_space`, a one-dimensional Box with finite bounds, and may name its features
     (`context_names`; else feature_0, feature_1, ...). The context arrives in that space's dtype, and every episode
     brings a seed of its own. An episode that has not ended by itself is truncated after `horizon` steps: the argument,
-    or the environment's own `horizon` or `spec.max_episode_steps`.
+    or the environment's own `horizon`, or that of its `TimeLimit`, or `spec.max_episode_steps`.
 
     Success is `info["success"]` or `info["is_success"]` at the end of every episode, or of none.
 
@@ -159,17 +160,27 @@ def _bounds(env: gym.Env[Any, Any], space: spaces.Box) -> ContextBounds:
         raise ConfigError(f"its context_space cannot be used: {error}") from None
 
 
+def _time_limit(env: gym.Env[Any, Any]) -> int | None:
+    """Of the strictest `TimeLimit`, which tells it in its spec only if the environment was made by an id."""
+    limits, wrapped = [], env
+    while isinstance(wrapped, gym.Wrapper):
+        if isinstance(wrapped, TimeLimit):
+            limits.append(wrapped._max_episode_steps)
+        wrapped = wrapped.env
+    return min(limits, default=env.spec.max_episode_steps if env.spec is not None else None)
+
+
 def _horizon(env: gym.Env[Any, Any], given: int | None) -> int:
     found: Any = given
     if found is None:
         try:
             found = env.get_wrapper_attr("horizon")
         except AttributeError:
-            found = env.spec.max_episode_steps if env.spec is not None else None
+            found = _time_limit(env)
     if found is None:
         raise ConfigError(
-            "the length of its episodes is unknown: give it an attribute `horizon`, or set env.kwargs.horizon: the "
-            "number of steps after which an episode is truncated"
+            "the length of its episodes is unknown: give it an attribute `horizon`, wrap it in Gymnasium's TimeLimit, "
+            "or set env.kwargs.horizon: the number of steps after which an episode is truncated"
         )
     if not isinstance(found, int | np.integer) or isinstance(found, bool) or found < 1:
         raise ConfigError(f"its horizon must be a whole number of steps, at least 1, not {str(found)[:80]!r}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +22,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from space_dist.config import DQNConfig, LearnerConfig
 from space_dist.envs import Observations
 from space_dist.errors import ConfigError
+from space_dist.importing import load
 from space_dist.policy import Array, Head, Layers, Statistics
 
 ALGORITHMS: dict[str, Any] = {
@@ -57,13 +57,10 @@ def policy_kwargs(config: LearnerConfig) -> dict[str, Any]:
 
 def policy_class(config: LearnerConfig) -> str | type[BasePolicy]:
     """SB3's name of a policy, or a class at an import path. Raises ConfigError if there is none."""
-    module_name, colon, name = config.policy.partition(":")
+    _, colon, name = config.policy.partition(":")
     if not colon:
         return config.policy
-    try:
-        found = getattr(importlib.import_module(module_name), name, None)
-    except (ImportError, SyntaxError, ValueError) as error:
-        raise ConfigError(f"learner.policy {config.policy!r}: cannot import {module_name!r}: {error}") from None
+    found = load(config.policy, "learner.policy", of_library=BasePolicy)
     if not (isinstance(found, type) and issubclass(found, BasePolicy)):
         raise ConfigError(f"learner.policy {config.policy!r}: {name!r} is no Stable-Baselines3 policy class")
     return found

@@ -1,7 +1,7 @@
 """A manifest and a profile become SLURM scripts: pure text, the same for the same input.
 
 Templates are Jinja2 files, ours or a user's own of the same name. What they print is quoted for the shell unless it is
-a number or was made safe before, so that no template can forget it.
+a number or was made safe before, so that no template can forget it: in the README, too, for its commands are pasted.
 """
 
 from __future__ import annotations
@@ -9,18 +9,20 @@ from __future__ import annotations
 import functools
 import re
 import shlex
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import jinja2
+from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from space_dist.config import clean
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.ledger import atomic_write
 from space_dist.manifest import Grid, Manifest
-from space_dist.slurm.profile import Profile
+from space_dist.slurm.profile import Profile, variables_in
 
 Mode = Literal["array", "cluster"]
 TRAIN, AGGREGATE, SUBMIT, README = "train.sbatch", "aggregate.sbatch", "submit.sh", "README.md"
@@ -200,23 +202,43 @@ def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
     Raises ConfigError with file and line of a template's fault.
     """
     shell = _environment(templates)
-    prose = shell.overlay(finalize=None)
+    _refuse_variables(grid.profile, templates)
     files = {TRAIN: f"{grid.mode}.sbatch.j2", AGGREGATE: "aggregate.sbatch.j2", SUBMIT: "submit.sh.j2",
              README: "README.md.j2"}  # fmt: skip
     values = _values(grid)
     texts = {}
     for name, template in files.items():
         try:
-            texts[name] = (prose if name == README else shell).get_template(template).render(values)
+            texts[name] = shell.get_template(template).render(values)
         except jinja2.TemplateNotFound as error:
             raise ConfigError(f"template {error.name} is missing") from None
         except jinja2.TemplateSyntaxError as error:
             raise ConfigError(
                 f"template {error.filename or error.name}, line {error.lineno}: {error.message}"
             ) from None
-        except jinja2.TemplateError as error:
-            raise ConfigError(f"template {template}: {error.message}") from None
+        except RecursionError as error:
+            raise ConfigError(f"template {_place(template, error)}: it includes itself, or what includes it") from None
+        except Exception as error:  # a template may compute anything
+            what = error.message if isinstance(error, jinja2.TemplateError) else f"{type(error).__name__}: {error}"
+            raise ConfigError(f"template {_place(template, error)}: {what}") from None
     return texts
+
+
+def _place(template: str, error: Exception) -> str:
+    """Where in a template an error lies, as Jinja2 writes it into the traceback: file and line."""
+    inside = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(".j2")]
+    return f"{inside[-1].filename}, line {inside[-1].lineno}" if inside else template
+
+
+def _refuse_variables(profile: Profile, templates: Path | None) -> None:
+    """Raise ConfigError if a profile sets a variable of somebody's own templates; of ours it cannot."""
+    for file in sorted(templates.glob("*.j2")) if templates is not None else ():
+        try:
+            taken = variables_in(file.read_text()) & profile.env.keys()
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"template {file} cannot be read: {error}") from None
+        if taken:
+            raise ConfigError(f"env: {min(taken)} is a variable of the template {file}")
 
 
 @functools.lru_cache(maxsize=4)
@@ -225,10 +247,13 @@ def _environment(templates: Path | None) -> jinja2.Environment:
         *([jinja2.FileSystemLoader(templates)] if templates is not None else []),
         jinja2.PackageLoader("space_dist.slurm"),
     ])  # fmt: skip
-    return jinja2.Environment(
+    # A stranger's template may hold any shell, which its reader sees; to write it out must run none of its Python.
+    made = ImmutableSandboxedEnvironment(
         loader=loader, undefined=jinja2.StrictUndefined, finalize=_quoted, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True, autoescape=False,  # noqa: S701 - `finalize` quotes, for the shell
+        keep_trailing_newline=True, autoescape=False,
     )  # fmt: skip
+    made.globals["shell_line"] = _shell_line
+    return made
 
 
 def _values(grid: Export) -> dict[str, Any]:
@@ -247,13 +272,17 @@ def _values(grid: Export) -> dict[str, Any]:
         "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
         "sync": manifest.tracking.uri is not None,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
-        "results": "" if grid.root is None else f"{grid.root / manifest.name}/",
         "env": {_Safe(name): value for name, value in profile.env.items()},
         "modules": profile.modules, "venv": profile.venv, "conda": profile.conda,
         "apptainer": profile.apptainer, "apptainer_options": profile.apptainer_options,
         "prologue": [_Safe(line) for line in profile.prologue], "command": profile.command,
         "interface": profile.interface, "temp": profile.temp,
     }  # fmt: skip
+
+
+def _shell_line(*words: object) -> _Safe:
+    """A line that can be pasted into a shell: each of its words is one, whatever it holds."""
+    return _Safe(f"{shlex.join(map(str, words)):<44}")
 
 
 def _quoted(value: Any) -> Any:

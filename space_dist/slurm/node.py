@@ -22,6 +22,7 @@ from types import FrameType
 import psutil
 
 from space_dist.errors import SpaceDistError, nearest
+from space_dist.importing import PYTHON
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _OBJECT_STORE_BYTES = 256 << 20
@@ -82,7 +83,7 @@ def serve(head: str, port: int, *, cpus: int, temp: Path, interface: str | None)
             return 0
         print(f"{socket.gethostname()}: Ray at {own}, {'head' if own == head else 'worker'}, {cpus} CPUs", flush=True)
         ray = subprocess.Popen(
-            [sys.executable, "-m", "ray.scripts.scripts", "start", *_options(own, head, port, cpus, temp)],
+            [*PYTHON, "-m", "ray.scripts.scripts", "start", *_options(own, head, port, cpus, temp)],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
             preexec_fn=_die_with_parent,  # noqa: PLW1509 - there are no threads here
         )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.resources
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,8 +19,23 @@ _MAX_WORD, _MAX_LINE, _MAX_ITEMS = 200, 1000, 50  # sbatch reads a directive int
 _EXTRA = re.compile(r"--([a-z][a-z0-9-]{0,40})(=.*)?")
 _TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<rest>\d+(?::\d+){0,2})")
 _MEMORY = r"^[0-9]{1,12}[KMGT]?$"
-_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-# What the scripts themselves are made of, and what would have sbatch do something else.
+_NAME = r"[A-Za-z_][A-Za-z0-9_]*"
+_VARIABLE = re.compile(_NAME)
+# A variable that a script sets, reads or unsets: `name=`, `${name`, `read -t name`, and those below.
+_USED = re.compile(
+    rf"(?<![\w$-])({_NAME})(?:\[[^]]*\])?\+?=|\$\{{?[#!]?({_NAME})|(?<![\w-])(?:mapfile|unset|export)((?: -?\w+)+)"
+)
+_COMMENT = re.compile(r"^\s*#.*$", re.MULTILINE)
+# Bash's own: read-only, or set by itself, or a change of how it reads what follows.
+_BASHS = frozenset((
+    "CDPATH", "CHILD_MAX", "COLUMNS", "COMP_WORDBREAKS", "COPROC", "DIRSTACK", "ENV", "EPOCHREALTIME", "EPOCHSECONDS",
+    "EUID", "EXECIGNORE", "FIGNORE", "FUNCNAME", "FUNCNEST", "GLOBIGNORE", "GROUPS", "HISTCMD", "HOSTNAME", "HOSTTYPE",
+    "IFS", "INPUTRC", "LINENO", "LINES", "MACHTYPE", "MAPFILE", "OLDPWD", "OPTARG", "OPTERR", "OPTIND", "OSTYPE",
+    "PIPESTATUS", "POSIXLY_CORRECT", "PPID", "PROMPT_COMMAND", "PS0", "PS1", "PS2", "PS3", "PS4", "PWD", "RANDOM",
+    "REPLY", "SECONDS", "SHELLOPTS", "SHLVL", "SRANDOM", "TIMEFORMAT", "TMOUT", "UID", "_",
+))  # fmt: skip
+# What the scripts themselves are made of, and what would have sbatch do something else; in full: sbatch takes any
+# beginning of a name for the whole.
 _OURS = {
     "array", "chdir", "kill-on-invalid-dep", "ntasks", "ntasks-per-node", "open-mode", "parsable", "requeue",
     "no-requeue", "test-only", "wait", "wrap", "help", "usage", "version",
@@ -151,7 +168,7 @@ class Profile(Section):
     prologue: tuple[Line, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
     """Lines of shell, written as they are, before anything of ours runs. Whoever writes them runs them."""
     command: tuple[Line, ...] = Field(default=("space-dist",), min_length=1, max_length=_MAX_ITEMS, strict=False)
-    """How to call this package there, a word each: [python, -m, space_dist.cli]."""
+    """How to call this package there, a word each: [python, -P, -m, space_dist.cli]."""
     interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,30}$")] | None = None
     """Network interface of the nodes for Ray in cluster mode, like ib0; null: the one that faces the other nodes."""
     temp: Annotated[str, Field(max_length=40, pattern=r"^/"), AfterValidator(_one_line)] = "/tmp"  # noqa: S108 - the node's own
@@ -171,10 +188,12 @@ class Profile(Section):
             if not found:
                 raise ValueError(f"{line!r} is no long option of sbatch: write --name or --name=value")
             name = found.group(1)
-            if name in _OURS:
-                raise ValueError(f"--{name} is what these scripts are made of; it cannot be set here")
-            if (field := name.replace("-", "_")) in cls.model_fields:
-                raise ValueError(f"--{name} has a field of its own: {field}")
+            if (ours := _meant(name, sorted(_OURS))) is not None:
+                raise ValueError(
+                    f"--{name}{_in_full(name, ours)} is what these scripts are made of; it cannot be set here"
+                )
+            if (field := _meant(name, [one.replace("_", "-") for one in cls.model_fields])) is not None:
+                raise ValueError(f"--{name}{_in_full(name, field)} has a field of its own: {field.replace('-', '_')}")
         return lines
 
     @field_validator("env")
@@ -183,7 +202,14 @@ class Profile(Section):
         for name in variables:
             if not _VARIABLE.fullmatch(name) or len(name) > _MAX_WORD:
                 raise ValueError(f"{name[:_MAX_WORD]!r} is no name of an environment variable")
-            if name.startswith("SLURM_") or name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_TMPDIR", "BASH_ENV"):
+            if name == "PATH":
+                raise ValueError(
+                    "PATH: nothing in a value is expanded, so it could only be replaced, and SLURM's own commands be "
+                    "lost; write a line into `prologue`: export PATH=/opt/bin:$PATH"
+                )
+            if name in _BASHS or name.startswith("BASH"):
+                raise ValueError(f"{name} is bash's own")
+            if name.startswith("SLURM_") or name in _variables_of_scripts():
                 raise ValueError(f"{name} is set by SLURM or by these scripts")
         return variables
 
@@ -205,6 +231,30 @@ class Profile(Section):
         if limit is not None and limit <= self.signal.lead_seconds:
             raise ValueError(f"time ({limit} s) must be longer than signal.lead_seconds ({self.signal.lead_seconds} s)")
         return self
+
+
+def variables_in(script: str) -> set[str]:
+    """Every variable that the text of a script, or of a template of one, sets, reads or unsets by name."""
+    found: set[str] = set()
+    for assigned, read, listed in _USED.findall(_COMMENT.sub("", script)):
+        found |= {assigned, read, *(word for word in listed.split() if not word.startswith("-"))} - {""}
+    return found
+
+
+@functools.cache
+def _variables_of_scripts() -> frozenset[str]:
+    folder = importlib.resources.files("space_dist.slurm") / "templates"
+    texts = [file.read_text() for file in folder.iterdir() if file.name.endswith(("sbatch.j2", "sh.j2"))]
+    return frozenset().union(*map(variables_in, texts))
+
+
+def _meant(name: str, options: Sequence[str]) -> str | None:
+    """The option that sbatch may take `name` for: itself, or one that begins so."""
+    return name if name in options else next((option for option in options if option.startswith(name)), None)
+
+
+def _in_full(name: str, option: str) -> str:
+    return "" if name == option else f", which may be short for --{option},"
 
 
 def load_profile(path: Path | None, overrides: Sequence[str] = ()) -> Profile:

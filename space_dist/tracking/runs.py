@@ -15,7 +15,6 @@ import os
 import re
 import sqlite3
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
+from space_dist.importing import PYTHON
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
 
 if TYPE_CHECKING:
@@ -515,7 +515,7 @@ def _draw_episodes(run: LoadedRun, folder: Path) -> list[Path]:
         return []  # nothing that acts
     if policy == "torch" or not env_id.startswith("space_dist/"):
         return []
-    command = [sys.executable, "-m", "space_dist.cli", "render", "--out", str(folder), "--", str(ledger.folder)]
+    command = [*PYTHON, "-m", "space_dist.cli", "render", "--out", str(folder), "--", str(ledger.folder)]
     try:
         subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_DRAW_SECONDS, check=True)
     except subprocess.CalledProcessError as error:

@@ -1,0 +1,143 @@
+"""Whose modules are imported, and what a config may have imported.
+
+Libraries' modules and ours come first, a user's own last: `python -m` and Ray's workers would have it the other way
+round, and a file `json.py` in the current folder would be taken for Python's. A config is data, whoever wrote it: its
+import paths name what a user has made, and no function of a library.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.machinery
+import importlib.metadata
+import importlib.util
+import re
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from space_dist.errors import ConfigError
+
+PYTHON = (sys.executable, "-P")
+"""How a Python of ours is started: -P keeps what happens to lie in the current folder from being imported first."""
+
+_OURS = "space_dist"
+_COMES_WITH_PYTHON = ("pip", "setuptools", "wheel")
+_REQUIREMENT = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^\]]*)\])?")
+_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
+
+
+def look_here_too() -> None:
+    """Look for a user's own modules in the current folder, after everywhere else."""
+    look_in([str(Path.cwd())])
+
+
+def look_in(folders: Iterable[str]) -> None:
+    """Look for modules in these folders, after everywhere else."""
+    sys.path.extend(folder for folder in folders if folder not in sys.path)
+
+
+def folders_of_user() -> list[str]:
+    """Where this process looks for modules, but for what belongs to its Python: for workers of its own, elsewhere."""
+    here = str(Path.cwd())
+    found = dict.fromkeys([*(str(Path(entry).absolute()) for entry in sys.path), here])
+    pythons = (sys.prefix, sys.base_prefix)
+    return [entry for entry in found if entry == here or not any(map(Path(entry).is_relative_to, pythons))]
+
+
+def load(import_path: str, key: str, *, of_library: type | None = None) -> object:
+    """What `my_package.my_module:name` names; None if the module has nothing of this name.
+
+    key: what the config calls it, for sentences. of_library: a class whose subclasses may come from a library all the
+    same, where a user's module has imported one. Raises ConfigError for a library's module or function, and for a
+    module that cannot be imported.
+    """
+    module, _, name = import_path.partition(":")
+    where = f"{key} {import_path!r}"
+    if (reason := why_refused(import_path)) is not None:
+        raise ConfigError(f"{where}: {reason}")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except (Exception, SystemExit) as error:  # somebody else's module may raise anything
+        what = f"{type(error).__name__}: {str(error)[:200]}"
+        raise ConfigError(f"{where}: cannot import {module!r}: {what}") from error
+    if of_library is not None and isinstance(found, type) and issubclass(found, of_library):
+        return found
+    home = getattr(found, "__module__", None)
+    if isinstance(home, str) and not isinstance(found, functools.partial) and (owner := _owner(home)) is not None:
+        raise ConfigError(
+            f"{where}: {module!r} has {name!r} from {home!r}, a module of {owner}; a config may name what you have "
+            "made yourself: define a function that calls it"
+        )
+    return found
+
+
+def why_refused(import_path: str) -> str | None:
+    """Why a config may not name this module, as a sentence; None if it may. Imports nothing."""
+    module = import_path.partition(":")[0]
+    owner = _owner(module)
+    if owner is None:
+        return None
+    if owner == _OURS:
+        return f"{module!r} is a module of space_dist itself, whose environments and policies are named by their ids"
+    return (
+        f"{module!r} is a module of {owner}, and an import path names a module of your own (which needs another name "
+        "if this one is yours: a library's comes first)"
+    )
+
+
+@functools.cache
+def _owner(module: str) -> str | None:
+    """Who has brought a module: Python, a library that space_dist needs, or space_dist; None: the user."""
+    top = module.partition(".")[0]
+    if top == _OURS:
+        return _OURS
+    if top in sys.stdlib_module_names or top in sys.builtin_module_names:
+        return "Python's standard library"
+    if _lies_here(top):  # which spares reading the metadata of all libraries
+        return None
+    needed = _needed()
+    return next((name for name in _providers().get(top, ()) if _normal(name) in needed), None)
+
+
+def _lies_here(top: str) -> bool:
+    try:
+        spec: importlib.machinery.ModuleSpec | None = importlib.util.find_spec(top) if top else None
+    except (ImportError, ValueError):
+        return False
+    if spec is None:
+        return False
+    places = [spec.origin] if spec.origin else list(spec.submodule_search_locations or ())
+    return any(Path(place).parent in (Path.cwd(), Path.cwd() / top) for place in places)
+
+
+@functools.cache
+def _providers() -> dict[str, list[str]]:
+    """Top-level module -> the installed distributions that have one."""
+    return {module: list(names) for module, names in importlib.metadata.packages_distributions().items()}
+
+
+@functools.cache
+def _needed() -> frozenset[str]:
+    """The distributions without which this package does not run, and theirs, and what every environment has."""
+    asked = [*((name, "") for name in _COMES_WITH_PYTHON), ("space-dist", "")]
+    seen: set[tuple[str, str]] = set()
+    while asked:
+        name, extra = asked.pop()
+        if (name, extra) in seen:
+            continue
+        seen.add((name, extra))
+        try:
+            requirements = importlib.metadata.requires(name) or []
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        for text in requirements:
+            found, wanted = _REQUIREMENT.match(text), _EXTRA.search(text)
+            if found is not None and (wanted is None or wanted.group(1) == extra):
+                asked += [(_normal(found[1]), one.strip()) for one in ("", *(found[2] or "").split(","))]
+    return frozenset(name for name, _ in seen)
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()

@@ -1,0 +1,208 @@
+"""Whose modules are imported: libraries' before a user's own, and no library's because a config says so."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from os import system  # noqa: F401 - imported for a stranger's config to name
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from gymnasium.envs.classic_control import CartPoleEnv  # noqa: F401 - likewise, and allowed
+
+from space_dist import cli
+from space_dist.errors import ConfigError
+from space_dist.importing import folders_of_user, load, look_in, why_refused
+from tests.patience import PATIENCE
+
+PROGRAM = Path(sys.executable).parent / "space-dist"
+
+ENVIRONMENT = """
+import gymnasium as gym
+import numpy as np
+
+class Walk(gym.Env):
+    context_space = gym.spaces.Box(np.array([0.1]), np.array([1.0]), dtype=np.float64)
+    observation_space = gym.spaces.Box(-99.0, 99.0, shape=(1,), dtype=np.float32)
+    action_space = gym.spaces.Discrete(2)
+    horizon = 8
+    context = np.array([0.5])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if options and "context" in options:
+            self.context = np.array(options["context"])
+        self.place, self.time = self.np_random.uniform(), 0
+        return np.array([self.place], dtype=np.float32), {}
+
+    def step(self, action):
+        self.place += self.context[0] * (2 * action - 1)
+        self.time += 1
+        return np.array([self.place], dtype=np.float32), -abs(self.place), False, self.time >= self.horizon, {}
+"""
+CONFIG = """
+name: walk
+env: {id: "my_walk:Walk"}
+instances: {train: train.csv, test: test.csv}
+curriculum: {kind: round_robin}
+learner: {kind: ppo, n_steps: 64, batch_size: 32, n_epochs: 1, net_arch: [8]}
+rollout: {shards: 2, slots: 2}
+budget: {steps: 128}
+evaluation: {every_steps: 128}
+"""
+# Imported by us, by Ray, by torch, or by Python itself; and one package of ours.
+NAMES = ("json", "yaml", "typing", "logging", "socket", "psutil", "ray", "torch", "gymnasium", "pydantic", "jinja2",
+         "tests")  # fmt: skip
+PACKAGES = ("numpy", "space_dist")
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """A folder with a user's environment and config, and modules that say when they are imported, and fail."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    trap = f"open({str(tmp_path / 'imported')!r}, 'a').write(__name__ + chr(10))\nraise ImportError(__name__)\n"
+    for name in NAMES:
+        (folder / f"{name}.py").write_text(trap)
+    for name in PACKAGES:
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text(trap)
+    (folder / "my_walk.py").write_text(ENVIRONMENT)
+    (folder / "walk.yaml").write_text(CONFIG)
+    (folder / "grid.yaml").write_text(
+        "name: walks\nextends: walk.yaml\nzip: {learner.n_epochs: [1, 2]}\nseeds: {start: 0, count: 1}\n"
+        "tracking: {uri: null}\n"
+    )
+    for name, first in (("train", 1), ("test", 5)):
+        rows = "".join(f"{index},0.{first + index}\n" for index in range(4))
+        (folder / f"{name}.csv").write_text(f"id,feature_0\n{rows}")
+    return folder
+
+
+def run(folder: Path, *command: object) -> str:
+    """What a command says, from a folder whose modules nobody must import."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    done = subprocess.run(
+        [*map(str, command)], cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
+    imported = folder.parent / "imported"
+    assert not imported.exists(), (imported.read_text(), done.stderr)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.ray
+def test_rollout_actors_import_libraries_first_and_a_users_module_last(hostile: Path) -> None:
+    run(hostile, PROGRAM, "train", "walk.yaml", "--out", "run", "--set", "resources.workers=1", "--set",
+        "tracking.uri=null")  # fmt: skip
+    assert '"state": "done"' in (hostile / "run/status.json").read_text()
+
+
+@pytest.mark.ray
+def test_a_grids_processes_import_libraries_first_and_a_users_module_last(hostile: Path) -> None:
+    run(hostile, PROGRAM, "grid", "run", "grid.yaml", "--root", "runs", "--max-parallel", 1)
+    assert run(hostile, PROGRAM, "grid", "status", "grid.yaml", "--root", "runs").count("done") >= 1
+
+
+def test_python_m_is_mended_as_soon_as_ours_is_reached(hostile: Path) -> None:
+    """What Python imports before, and which `space_dist` it finds, is up to who calls it: -P decides both."""
+    run(hostile, sys.executable, "-P", "-m", "space_dist.cli", "config", "check", "walk.yaml")
+    for name in ("space_dist/__init__.py", "typing.py"):
+        (hostile / name).unlink()
+    (hostile / "space_dist").rmdir()
+    run(hostile, sys.executable, "-m", "space_dist.cli", "config", "check", "walk.yaml")
+
+
+def test_workers_look_where_their_driver_does_and_last(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", "/my/modules", *sys.path])
+    folders = folders_of_user()
+    assert folders[:2] == [str(tmp_path), "/my/modules"]
+    assert not any("site-packages" in folder for folder in folders)
+    monkeypatch.setattr(sys, "path", ["/library"])
+    look_in(folders)
+    look_in(folders)
+    assert sys.path == ["/library", *folders]
+
+
+# ---- what a config may name -----------------------------------------------------------------------------------------
+
+LIBRARIES = {
+    "os:system": "Python's standard library", "posix:system": "Python's standard library",
+    "subprocess:getoutput": "Python's standard library", "os.path:join": "Python's standard library",
+    "builtins:eval": "Python's standard library", "antigravity:x": "Python's standard library",
+    "numpy:load": "numpy", "torch.hub:load": "torch", "ray:init": "ray", "six.moves:reload_module": "six",
+    "jinja2.sandbox:modifies_known_mutable": "jinja2", "virtualenv:cli_run": "virtualenv", "pip:main": "pip",
+    "setuptools:setup": "setuptools", "gymnasium:make": "gymnasium", "stable_baselines3:PPO": "stable",
+    "space_dist.cli:main": "space_dist itself",
+}  # fmt: skip
+
+
+def test_modules_of_libraries_are_told_from_a_users_own() -> None:
+    for path, owner in LIBRARIES.items():
+        if path.startswith("setuptools") and why_refused(path) is None:
+            continue  # not every environment has it
+        assert owner.lower() in (why_refused(path) or "").lower(), path
+    for path in ("tests.tiny_env:make", "nowhere_env:make", ":x", "carl.envs:CARLCartPole",
+                 "pybullet_envs_gymnasium:x"):  # fmt: skip
+        assert why_refused(path) is None
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    try:
+        cli.main()
+    except SystemExit as error:
+        return int(error.code or 0)
+    return 0
+
+
+def test_reading_a_strangers_config_runs_no_function_of_a_library(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], hostile: Path
+) -> None:
+    canary = hostile / "canary"
+    monkeypatch.chdir(hostile)
+    act = f"command: touch {canary}"
+    text = CONFIG.replace('{id: "my_walk:Walk"}', f'{{id: "os:system", kwargs: {{{act}}}}}')
+    assert text != CONFIG
+    Path("walk.yaml").write_text(text)
+    for arguments in (("config", "check", "walk.yaml"), ("grid", "plan", "grid.yaml"), ("train", "walk.yaml")):
+        assert command(monkeypatch, *arguments) == 2, arguments
+        said = capsys.readouterr().err
+        assert arguments[-1] in said
+        assert "env.id: 'os' is a module of Python's standard library" in said
+    kwarg = ("--kwarg", act.replace(": ", "="))
+    for arguments in (("env", "check", "os:system", *kwarg),
+                      ("instances", "sample", "uniform", "--env", "os:system", *kwarg, "--out", "x")):  # fmt: skip
+        assert command(monkeypatch, *arguments) == 2, arguments
+        assert "'os' is a module of Python's standard library" in capsys.readouterr().err
+    policy = CONFIG.replace("kind: ppo", 'kind: ppo, policy: "stable_baselines3.ppo.policies:MlpPolicy"')
+    Path("walk.yaml").write_text(policy)
+    assert command(monkeypatch, "config", "check", "walk.yaml") == 2
+    assert "policy: 'stable_baselines3.ppo.policies' is a module of stable" in capsys.readouterr().err
+    assert not canary.exists()
+
+
+made = functools.partial(gym.make, "CartPole-v1")
+
+
+def test_what_a_users_module_has_imported_from_a_library_is_no_function_of_its() -> None:
+    with pytest.raises(ConfigError, match=r"has 'system' from 'posix', a module of Python's standard library"):
+        load(f"{__name__}:system", "env.id", of_library=gym.Env)
+    with pytest.raises(ConfigError, match="define a function that calls it"):
+        load(f"{__name__}:Path", "env.id", of_library=gym.Env)
+    for name in ("CartPoleEnv", "made", "run"):
+        assert load(f"{__name__}:{name}", "env.id", of_library=gym.Env) is globals()[name]
+    assert load(f"{__name__}:nothing", "env.id") is None
+
+
+def test_of_carls_modules_only_environments_are_named(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    assert command(monkeypatch, "env", "check", "carl.envs.gymnasium:import_module") == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert command(monkeypatch, "env", "check", "carl.utils.types:Context") == 2
+    assert "carl" in capsys.readouterr().err
