@@ -26,7 +26,8 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, Patience, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
-from space_dist.ledger import Ledger, atomic_write, owner_alive
+from space_dist.files import atomic_write
+from space_dist.ledger import Ledger, owner_alive
 
 FORMAT = 1
 MANIFEST = "manifest.json"
