@@ -257,6 +257,10 @@ class Ledger:
             "before it"
         )
 
+    def abandoned(self, status: Status) -> bool:
+        """Whether the run was left behind by a process that is gone, and could not say why."""
+        return status.state == "running" and not self.owner_alive()
+
     def owner_alive(self) -> bool:
         """Whether a live process works on this run now, as far as can be told from this machine."""
         return owner_alive(self.lock_file)
