@@ -236,7 +236,9 @@ def test_a_dead_server_costs_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "store", ["file:///srv/mlruns", "mlruns", "/srv/mlruns", "", "sqlite://", "sqlite:///:memory:", "sqlite:mlflow.db",
-              "postgresql://user:word@host/db", "http://user:word@host:5000", "http://[", "databricks"]
+              "postgresql://user:word@host/db", "http://user:word@host:5000", "http://[", "databricks",
+              "http:///", "https://:5000", "http://host:99999", "http://host:0", "http://user:word@[", "http://a b/",
+              "http://host/?token=word@", "sqlite:///folder/", "sqlite://user:word@host/db"]
 )  # fmt: skip
 def test_other_stores_are_refused(tmp_path: Path, store: str) -> None:
     with pytest.raises(ConfigError, match=r"sqlite:////absolute|MLFLOW_TRACKING_PASSWORD") as refusal:

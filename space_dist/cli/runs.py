@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from space_dist.cli.terminal import STOP, Json, Overrides, console, say, warn, write
+from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, say, warn, write
 from space_dist.errors import ConfigError, about, exits_refused
 
 if TYPE_CHECKING:
@@ -110,6 +110,7 @@ def evaluate(
     if as_json:
         print(json.dumps({"run": str(run), "steps": status.steps, "state": state, "instances": str(instances),
                           "n_instances": len(chosen), **means}))  # fmt: skip
+        delivered()
         return
     table = Table(title=f"{config.name}, seed {config.seed}, after {status.steps:,} steps ({state})")
     for name in ("instances", *means):
@@ -117,6 +118,8 @@ def evaluate(
     shown = ["—" if value is None else f"{value:.3f}" for value in means.values()]
     table.add_row(str(len(chosen)), *shown)
     console.print(table)
+    if out is None:
+        delivered()
 
 
 def report(

@@ -21,10 +21,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import urlsplit
 
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
+from space_dist.place import absolute_uri
+from space_dist.tracking_uri import UriError, checked_uri
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -49,7 +50,6 @@ _MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
 _DRAW_SECONDS: Final = 60.0  # for the pictures of a run
-_ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
 # MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
 _ENVIRONMENT: Final = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -531,32 +531,16 @@ def _whole_number(text: str) -> int:
     return int(text) if re.fullmatch(r"[0-9]{1,15}", text) else 0
 
 
-def checked_uri(uri: str) -> str:
+def usable_uri(uri: str) -> str:
     """The URI, with an absolute path if it is SQLite's. Raises ConfigError for a store that is not mirrored to."""
     try:
-        parts = urlsplit(uri)
-        host, has_credentials = parts.hostname, "@" in parts.netloc
-    except ValueError:
-        raise ConfigError(f"the tracking URI {uri!r} is not a URI; {_ALLOWED}") from None
-    if parts.scheme in ("http", "https") and host:
-        if has_credentials:
-            raise ConfigError(
-                f"the tracking URI for {host} contains credentials, which would be stored with every run; give them in "
-                "the environment: MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
-            )
-        return uri.rstrip("/")
-    if parts.scheme == "sqlite":
-        return f"sqlite:///{_database(uri)}"
-    if parts.scheme in ("", "file"):
-        raise ConfigError(f"the tracking URI {uri!r} is a folder of files, which MLflow no longer supports; {_ALLOWED}")
-    raise ConfigError(f"a tracking URI of the kind {parts.scheme}: cannot be mirrored to; {_ALLOWED}")
+        return str(absolute_uri(checked_uri(uri)))
+    except UriError as error:
+        raise ConfigError(str(error)) from None
 
 
 def _database(uri: str) -> Path:
-    name = uri.removeprefix("sqlite:///")
-    if name == uri or not name or name == ":memory:" or "?" in name:
-        raise ConfigError(f"the tracking URI {uri!r} names no database file; {_ALLOWED}")
-    return Path(name).absolute()
+    return Path(uri.removeprefix("sqlite:///"))
 
 
 def _new_client(uri: str) -> MlflowClient:

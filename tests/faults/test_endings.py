@@ -103,3 +103,19 @@ def test_a_run_folder_with_a_link_is_refused_in_a_sentence(name: str, tmp_path: 
     assert f"{name} is a link" in done.stderr
     assert "Traceback" not in done.stderr
     assert (tmp_path / "precious").read_text() == "precious"
+
+
+@pytest.mark.parametrize("shell", [">&-", ">/dev/full", "| head -0", ">&- 2>&-", "2>/dev/full >/dev/full"])
+def test_work_that_is_done_ends_with_0_whatever_became_of_its_output(shell: str, tmp_path: Path) -> None:
+    done = train(tmp_path, "none", shell=shell)
+    assert done.returncode == 0, done.stderr
+    assert Ledger(tmp_path / "run").status().state == "done"
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(("shell", "code"), [(">/dev/full", 1), ("| head -1", 0), (">/dev/null", 0)])
+def test_a_command_that_is_for_its_output_says_that_it_is_lost(shell: str, code: int) -> None:
+    command = f"set -o pipefail; {sys.executable} -m space_dist.cli config schema {shell}"
+    done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == code
+    assert done.stderr == ("space-dist: standard output cannot be written: No space left on device\n" if code else "")
