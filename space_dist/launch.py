@@ -33,7 +33,7 @@ from space_dist.errors import (
     about,
     exits_refused,
 )
-from space_dist.files import LogFile, in_words
+from space_dist.files import LogFile, appending, in_words
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_device
@@ -42,11 +42,12 @@ from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
+from space_dist.tracking.pusher import ended_within
 from space_dist.training import Progress, Training, make_env, make_setup, policy_in, resolved
 
 log = logging.getLogger("space_dist")
 
-_FINAL_PUSH_SECONDS = 120.0
+_FINAL_PUSH_SECONDS = 45.0  # for all of it: a server that answers badly (20 s a request), the last rows, the pictures
 
 
 @dataclass(frozen=True)
@@ -392,25 +393,22 @@ def _start_pusher(config: RunConfig, ledger: Ledger) -> subprocess.Popen[bytes] 
         return None
     command = [sys.executable, "-m", "space_dist.cli", "sync", "--follow", "--", str(ledger.folder)]
     try:
-        with (ledger.folder / "tracking.log").open("ab") as output:
+        with appending(ledger.folder / "tracking.log") as output:
             # A session of its own: Ctrl-C is for the run; the pusher ends by itself once the run has.
             return subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
             )  # fmt: skip
     except OSError as error:
-        log.warning("nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", error)
+        log.warning(
+            "nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", in_words(error)
+        )
         return None
 
 
 def _final_push(config: RunConfig, ledger: Ledger, pusher: subprocess.Popen[bytes] | None) -> str | None:
     if pusher is None:
         return None
-    try:
-        code = pusher.wait(timeout=_FINAL_PUSH_SECONDS)
-    except subprocess.TimeoutExpired:
-        pusher.terminate()
-        code = 1
-    if code == 0:
+    if ended_within(pusher, _FINAL_PUSH_SECONDS):
         return None
     return (
         f"MLflow at {config.tracking.uri} could not be brought up to date; nothing is lost: "

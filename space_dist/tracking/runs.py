@@ -7,7 +7,6 @@ what dies in between pushes some points again, and MLflow keeps a point of the s
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import logging
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
+from space_dist.files import in_words, locked
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
 from space_dist.place import absolute_uri
 from space_dist.tracking_uri import UriError, checked_uri
@@ -49,14 +49,12 @@ _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; ml
 _MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
-_DRAW_SECONDS: Final = 60.0  # for the pictures of a run
-# MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
+_TURN_SECONDS: Final = 600.0  # a grid of thousands of runs takes minutes
+_DRAW_SECONDS: Final = 30.0  # for the pictures of a run
+# MLflow's own defaults print a line a run and call home.
 _ENVIRONMENT: Final = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",  # seconds
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
-    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
 }
 
 
@@ -555,9 +553,7 @@ def _new_client(uri: str) -> MlflowClient:
 def _open_database(uri: str, database: Path) -> MlflowClient:
     """A client whose tables exist. Creating them is no transaction: two pushers at once would break each other."""
     database.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(database.parent / f".{database.name}.lock", os.O_RDWR | os.O_CREAT, 0o644)
-    with os.fdopen(descriptor) as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with _locked(database.parent / f".{database.name}.lock"):
         # MLflow would try for minutes to open a file that it can never write to.
         with contextlib.closing(sqlite3.connect(database, timeout=_DATABASE_WAIT_SECONDS)) as connection:
             connection.execute("BEGIN IMMEDIATE")
@@ -570,30 +566,26 @@ def _open_database(uri: str, database: Path) -> MlflowClient:
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold a file's lock, which the system takes back from whoever dies. Raises TrackingError if it cannot be had."""
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise TrackingError(f"cannot write {path}, by which pushers take turns: {error.strerror}") from None
-    with os.fdopen(descriptor) as file:
+    with contextlib.ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            log.warning("waiting for another process that pushes at this moment (%s)", path)
-            fcntl.flock(file, fcntl.LOCK_EX)
+            held.enter_context(locked(path, _TURN_SECONDS))
         except OSError as error:
-            raise TrackingError(f"cannot lock {path}, by which pushers take turns: {error.strerror}") from None
+            raise TrackingError(f"cannot lock {path}, by which pushers take turns: {in_words(error)}") from None
         yield
 
 
 @contextlib.contextmanager
 def store_errors(uri: str) -> Iterator[None]:
     """Run MLflow, and say what went wrong in our words. Raises TrackingError and RefusedError."""
-    for name, value in _ENVIRONMENT.items():
+    from space_dist.tracking import answers  # here: it imports requests
+
+    for name, value in {**_ENVIRONMENT, **answers.ENVIRONMENT}.items():
         os.environ.setdefault(name, value)  # MLflow reads some of them when it is imported: next
     import requests
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
+    answers.bound_answers()
     try:
         yield
     except MlflowException as error:
