@@ -21,6 +21,7 @@ from ruamel.yaml.events import AliasEvent
 
 from space_dist.errors import ConfigError, nearest
 from space_dist.importing import why_refused
+from space_dist.tracking_uri import UriError, checked_uri
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -683,14 +684,6 @@ class CheckpointConfig(Section):
     """Seconds between checkpoints, at most (and at least one update)."""
 
 
-def checked_uri(value: str | None) -> str | None:
-    """A tracking URI of a kind we know. Raises ValueError for any other."""
-    kinds = ("sqlite:///", "http://", "https://")
-    if value is not None and not any(value.startswith(kind) and value != kind for kind in kinds):
-        raise ValueError("a tracking URI is sqlite:///FILE or http(s)://HOST:PORT")
-    return value
-
-
 class TrackingConfig(Section):
     """Where MLflow keeps its mirror of the run. Decides no result."""
 
@@ -702,7 +695,7 @@ class TrackingConfig(Section):
     @field_validator("uri")
     @classmethod
     def _known_kind(cls, value: str | None) -> str | None:
-        return checked_uri(value)
+        return None if value is None else checked_uri(value)
 
     live: bool = True
     """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
@@ -1121,6 +1114,8 @@ def _explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[st
         message = str(context.get("error", fault["msg"]))
         if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
             return f"{where}: {key}: {message}" if key else f"{where}: {message}"
+        if isinstance(context.get("error"), UriError):
+            return f"{where}: {key}: {message}"
         return f"{where}: {key}: {message}, not {_short(given)}"
     return f"{where}: {key or 'the whole file'}: {_short(given)}: {fault['msg']}"
 

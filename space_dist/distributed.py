@@ -38,7 +38,7 @@ from threadpoolctl import threadpool_limits
 
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
@@ -65,7 +65,8 @@ class _Timed:
     def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
         """Seconds, and the answer: one object, or each of `several`."""
         start = time.monotonic()
-        answer = getattr(self, method)(*arguments, **options)
+        with exits_refused():  # which Ray would take for the actor's own wish, and the driver for a loss
+            answer = getattr(self, method)(*arguments, **options)
         seconds = time.monotonic() - start
         return (seconds, *answer) if several else (seconds, answer)
 

@@ -33,6 +33,17 @@ class Interrupted(SpaceDistError):  # noqa: N818 - an interruption is an outcome
     exit_code = 75  # EX_TEMPFAIL of sysexits.h: what batch systems take for "requeue me"
 
 
+@contextlib.contextmanager
+def exits_refused() -> Iterator[None]:
+    """Around a user's code: have a `sys.exit` in it be an error, for it would end our process as if all were well."""
+    try:
+        yield
+    except SystemExit as error:
+        raise SpaceDistError(
+            f"the environment, or something that it uses, tried to end the process (SystemExit: {error.code})"
+        ) from error
+
+
 def nearest(word: str, allowed: Iterable[str]) -> str:
     """`"; did you mean 'eta'?"` where one of `allowed` resembles `word`, else `"."`: the end of a clause."""
     close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.5)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import logging
 import os
 import signal
@@ -23,11 +22,13 @@ from pathlib import Path
 from typing import Protocol
 
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
+from space_dist.files import appending, in_words, locked
 from space_dist.importing import PYTHON
 from space_dist.ledger import Lock
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.provenance import code_digest
 from space_dist.standing import Attempts, Ended, Standing, concluded, may_retry, standing_of, standings, unheard
+from space_dist.tracking.pusher import ended_within
 
 log = logging.getLogger("space_dist")
 
@@ -36,6 +37,7 @@ _TICK_SECONDS = 0.2
 _ELSEWHERE_SECONDS = 2.0
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0
+_FREEZE_SECONDS = 120.0  # for others who freeze it at this moment
 _ABANDONED_SECONDS = 5.0  # after the grace time of a run whose supervisor is gone
 _LIBRARIES_MB = 700  # of a process that trains, before it has a run
 MEMBERS = {"cpu": 32, "cuda": 1024}  # of a population, at most: more gain little, and are lost together
@@ -54,11 +56,10 @@ def freeze(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest 
     """Make this the grid's manifest, as tasks of a batch system may all do at once; returns the one before it."""
     try:
         grid.folder.mkdir(parents=True, exist_ok=True)
-        with (grid.folder / "manifest.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with locked(grid.folder / "manifest.lock", _FREEZE_SECONDS):
             return _freeze_alone(grid, manifest, files)
     except OSError as error:
-        raise LedgerError(f"cannot write the grid's folder {grid.folder}: {error.strerror}") from None
+        raise LedgerError(f"cannot write the grid's folder {grid.folder}: {in_words(error)}") from None
 
 
 def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Manifest | None:
@@ -307,7 +308,7 @@ def working_on(
         yield
     finally:
         lock.release()  # by which the pusher knows that it may end
-        if pusher is not None and not _ends_well(pusher):
+        if pusher is not None and not ended_within(pusher, _FINAL_PUSH_SECONDS):
             say(
                 f"warning: MLflow at {manifest.tracking.uri} could not be brought up to date; nothing is lost: "
                 f"`space-dist sync {grid.folder}` replays the grid (details: {grid.tracking_log})"
@@ -331,7 +332,7 @@ def _acquired(
                 raise Interrupted(f"stopped while waiting ({reason})") from None
             time.sleep(_ELSEWHERE_SECONDS)
         except OSError as error:
-            raise LedgerError(f"cannot write the grid's folder {grid.folder}: {error.strerror}") from None
+            raise LedgerError(f"cannot write the grid's folder {grid.folder}: {in_words(error)}") from None
         else:
             return lock
 
@@ -341,15 +342,7 @@ def _start_pusher(grid: Grid, manifest: Manifest) -> subprocess.Popen[bytes] | N
     if manifest.tracking.uri is None:
         return None
     command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(grid.folder)]
-    with grid.tracking_log.open("ab") as output:
+    with appending(grid.tracking_log) as output:
         return subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
         )  # fmt: skip
-
-
-def _ends_well(pusher: subprocess.Popen[bytes]) -> bool:
-    try:
-        return pusher.wait(timeout=_FINAL_PUSH_SECONDS) == 0
-    except subprocess.TimeoutExpired:
-        pusher.terminate()
-        return False

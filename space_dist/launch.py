@@ -9,13 +9,16 @@ import io
 import itertools
 import json
 import logging
+import os
 import subprocess
+import sys
 import time
 import traceback
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,21 +28,31 @@ from space_dist import config as configs
 from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
-from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError, about
+from space_dist.errors import (
+    ConfigError,
+    Interrupted,
+    LedgerError,
+    RunLockedError,
+    SpaceDistError,
+    about,
+    exits_refused,
+)
+from space_dist.files import LogFile, appending, in_words
 from space_dist.importing import PYTHON
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_device, torch_probes
-from space_dist.ledger import Ledger, RunWriter, Status, decode_checkpoint
+from space_dist.ledger import Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
+from space_dist.tracking.pusher import ended_within
 from space_dist.training import Progress, Training, make_env, make_setup, policy_in, resolved
 
 log = logging.getLogger("space_dist")
 
-_FINAL_PUSH_SECONDS = 120.0
+_FINAL_PUSH_SECONDS = 45.0  # for all of it: a server that answers badly (20 s a request), the last rows, the pictures
 
 
 @dataclass(frozen=True)
@@ -307,7 +320,8 @@ def _cluster(course: Course) -> Iterator[Cluster]:
 def _failures_noted(writer: RunWriter) -> Iterator[None]:
     """Leave a true status behind, whatever happens."""
     try:
-        yield
+        with exits_refused(), _zero_exits_noted(writer):
+            yield
     except Interrupted as error:
         log.warning("%s", error)
         raise
@@ -317,18 +331,58 @@ def _failures_noted(writer: RunWriter) -> Iterator[None]:
     except SpaceDistError as error:
         _note_failure(writer, str(error))
         raise
-    except (Exception, SystemExit) as error:  # a user's environment may even exit
+    except KeyboardInterrupt:  # whoever calls us from a program of their own has no handlers of ours
+        _note_failure(writer, "KeyboardInterrupt", "interrupted")
+        raise
+    except GeneratorExit:  # its population ends
+        raise
+    except BaseException as error:  # a user's environment may raise anything
         log.error("%s", traceback.format_exc())  # the traceback is for the log alone
         what = f"{type(error).__name__}: {error}"
         _note_failure(writer, what)
         raise SpaceDistError(f"the run failed: {what[:500]}. The traceback is in {writer.ledger.log}") from error
 
 
-def _note_failure(writer: RunWriter, message: str) -> None:
+def _note_failure(writer: RunWriter, message: str, state: State = "failed") -> None:
     log.error("%s", message)
     if writer.status is not None:
         with contextlib.suppress(LedgerError, RunLockedError):  # the disk may be what failed
-            writer.set_status(replace(writer.status, state="failed", message=message[:2000], updated_at=time.time()))
+            writer.set_status(replace(writer.status, state=state, message=message[:2000], updated_at=time.time()))
+
+
+_unfinished: list[RunWriter] = []  # of the runs that this process is at
+_restore: list[Callable[[int], NoReturn]] = []  # what `os._exit` is otherwise
+
+
+@contextlib.contextmanager
+def _zero_exits_noted(writer: RunWriter) -> Iterator[None]:
+    """Keep `os._exit(0)` from ending a run that is not done with the exit code of one that is.
+
+    It cannot be caught, so it is stood in for while a run is unfinished. What ends the process from C is not noticed:
+    that would take a parent process, through which every signal, lock and limit of the run had to go. Grids have one,
+    the supervisor; elsewhere the run's owner is seen to be gone.
+    """
+    if not _unfinished:
+        end, owner = os._exit, os.getpid()
+
+        def told(code: int) -> NoReturn:
+            if code == 0 and os.getpid() == owner:  # processes that were forked end so
+                code = os.EX_SOFTWARE
+                what = "the environment, or something that it uses, ended the process (os._exit(0))"
+                print(f"space-dist: {what}", file=sys.stderr, flush=True)
+                for unfinished in _unfinished:
+                    _note_failure(unfinished, what)
+            end(code)
+
+        _restore.append(end)
+        os._exit = told  # type: ignore[assignment]
+    _unfinished.append(writer)
+    try:
+        yield
+    finally:
+        _unfinished.remove(writer)
+        if not _unfinished:
+            os._exit = _restore.pop()  # type: ignore[assignment]
 
 
 speaking: contextvars.ContextVar[Path | None] = contextvars.ContextVar("speaking", default=None)
@@ -338,9 +392,9 @@ speaking: contextvars.ContextVar[Path | None] = contextvars.ContextVar("speaking
 @contextlib.contextmanager
 def _logging_to(path: Path) -> Iterator[None]:
     try:
-        handler = logging.FileHandler(path)
+        handler = LogFile(path)
     except OSError as error:
-        raise LedgerError(f"cannot write {path}: {error.strerror}") from None
+        raise LedgerError(f"cannot write {path}: {in_words(error)}") from None
     handler.handleError = lambda record: None  # type: ignore[method-assign] # a full disk is the ledger's to tell
     handler.addFilter(lambda record: speaking.get() in (None, path.parent))
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -359,25 +413,22 @@ def _start_pusher(config: RunConfig, ledger: Ledger) -> subprocess.Popen[bytes] 
         return None
     command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(ledger.folder)]
     try:
-        with (ledger.folder / "tracking.log").open("ab") as output:
+        with appending(ledger.folder / "tracking.log") as output:
             # A session of its own: Ctrl-C is for the run; the pusher ends by itself once the run has.
             return subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
             )  # fmt: skip
     except OSError as error:
-        log.warning("nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", error)
+        log.warning(
+            "nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", in_words(error)
+        )
         return None
 
 
 def _final_push(config: RunConfig, ledger: Ledger, pusher: subprocess.Popen[bytes] | None) -> str | None:
     if pusher is None:
         return None
-    try:
-        code = pusher.wait(timeout=_FINAL_PUSH_SECONDS)
-    except subprocess.TimeoutExpired:
-        pusher.terminate()
-        code = 1
-    if code == 0:
+    if ended_within(pusher, _FINAL_PUSH_SECONDS):
         return None
     return (
         f"MLflow at {config.tracking.uri} could not be brought up to date; nothing is lost: "

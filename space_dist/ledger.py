@@ -22,13 +22,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import fcntl
 import functools
 import hashlib
 import io
 import json
 import logging
 import os
+import re
 import socket
 import threading
 import time
@@ -43,6 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import LedgerError, RunLockedError
+from space_dist.files import TEMPORARIES, appending, atomic_write, locked, read_file, why_not_own
 
 log = logging.getLogger("space_dist")
 
@@ -55,9 +56,14 @@ FORMAT = 1
 KEPT_CHECKPOINTS = 2
 LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
 HEARTBEAT_SECONDS = 10.0
+CLAIM_SECONDS = 10.0  # for a lock that another process holds; it does so while it writes
+OWNER_SECONDS = 60.0  # the same for the owner, whose run ends then
 _MAX_STATUS_BYTES = 1 << 20
+_MAX_COUNT = 10**12  # rounds, transitions and bytes of a run's files stay below it, and names in twelve digits
+_MAX_NAME = 1000  # characters of an array's
+_ARRAY = "array/"
+_CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
-_TEMPORARY = ".*.tmp"
 _CRC_LENGTH = len(',"crc":"00000000"}\n')
 
 
@@ -109,25 +115,6 @@ class Segment:
         return f"{self.first:012d}-{self.first + self.count:012d}.npz"
 
 
-def atomic_write(path: Path, content: bytes) -> None:
-    """Write a whole file or nothing, and be sure that it is on disk."""
-    temporary = path.with_name(_TEMPORARY.replace("*", path.name))
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def encode_row(row: Row) -> bytes:
     """One line: the row as JSON with its own CRC-32 as last field."""
     body = json.dumps(row, separators=(",", ":"), allow_nan=False)
@@ -175,8 +162,7 @@ class Ledger:
     def status(self) -> Status:
         """Read `status.json`. Raises LedgerError if it is missing or damaged."""
         try:
-            with self.status_file.open("rb") as file:
-                content = file.read(_MAX_STATUS_BYTES + 1)
+            content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
             raise LedgerError(f"{self.folder} holds no run: it has no status.json") from None
         except OSError as error:
@@ -188,7 +174,12 @@ class Ledger:
                 raise ValueError("checksum")
             if data["format"] != FORMAT:
                 raise LedgerError(f"{self.status_file} has format {data['format']}; this version reads format {FORMAT}")
-            return Status(**data)
+            status = Status(**data)
+            if status.checkpoint is not None and not _CHECKPOINT.fullmatch(status.checkpoint):
+                raise ValueError("it names what is no checkpoint")
+            if any(Path(name).name != name for name in status.files):
+                raise ValueError("it names files elsewhere")
+            return status
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             raise LedgerError(f"{self.status_file} is damaged") from None
 
@@ -266,24 +257,47 @@ class Ledger:
             "before it"
         )
 
+    def abandoned(self, status: Status) -> bool:
+        """Whether the run was left behind by a process that is gone, and could not say why."""
+        return status.state == "running" and not self.owner_alive()
+
     def owner_alive(self) -> bool:
         """Whether a live process works on this run now, as far as can be told from this machine."""
         return owner_alive(self.lock_file)
 
 
 def owner_alive(lock_file: Path) -> bool:
-    """Whether a live process holds the lock, as far as can be told from this machine."""
+    """Whether a live process holds the lock, as far as can be told from this machine.
+
+    Another user's lock cannot be read: that its owner lives is believed for a lease after its last sign.
+    """
     try:
-        owner = json.loads(lock_file.read_bytes() or b"{}")
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(owner, dict) and believed_alive(owner)
+        return believed_alive(_owner(lock_file))
+    except PermissionError:
+        with contextlib.suppress(OSError):
+            return abs(time.time() - lock_file.stat().st_mtime) < LEASE_SECONDS
+    except OSError:
+        pass
+    return False
+
+
+def _owner(lock_file: Path) -> dict[str, Any]:
+    """What a lock says of its owner; nothing if it is garbled. Raises OSError if it cannot be read."""
+    return _decoded_owner(read_file(lock_file, _MAX_STATUS_BYTES))
+
+
+def _decoded_owner(content: bytes) -> dict[str, Any]:
+    try:
+        owner = json.loads(content or b"{}")
+    except (ValueError, RecursionError):
+        return {}
+    return owner if isinstance(owner, dict) else {}
 
 
 def _read(path: Path, *, missing: bytes | None = None) -> bytes:
     """A file's content; `missing`, if given, where there is none. Raises LedgerError if that cannot be had."""
     try:
-        return path.read_bytes()
+        return read_file(path)
     except FileNotFoundError:
         if missing is not None:
             return missing
@@ -313,33 +327,81 @@ def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     meta["sha256"] = _digest(meta, checkpoint.arrays)
     buffer = io.BytesIO()
     encoded = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
-    _savez(buffer, {"meta": encoded, **{f"array/{name}": array for name, array in checkpoint.arrays.items()}})
+    _savez(buffer, {"meta": encoded, **{f"{_ARRAY}{name}": array for name, array in checkpoint.arrays.items()}})
     return buffer.getvalue()
 
 
 def decode_checkpoint(content: bytes) -> Checkpoint:
     """The inverse of `encode_checkpoint`. Raises ValueError for anything that is not exactly what was written."""
-    try:
+    arrays = _decode_arrays(content)
+    with _garbled():
+        meta = json.loads(arrays.pop("meta").tobytes())
+        if not all(name.startswith(_ARRAY) for name in arrays):
+            raise ValueError("it holds what checkpoints do not")
+        arrays = {name.removeprefix(_ARRAY): array for name, array in arrays.items()}
+        written = meta.pop("sha256")
+        if meta["format"] != FORMAT or written != _digest(meta, arrays):
+            raise ValueError("checksum")
+        segments = tuple(_checked_segment(*segment) for segment in meta["segments"])
+        return Checkpoint(_count(meta["round"], "round"), arrays, dict(meta["data"]), segments)
+
+
+def _decode_arrays(content: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz of ours, by name. Raises ValueError if it is compressed, damaged, or named like a path."""
+    with _garbled():
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
             if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
                 raise ValueError("compressed")
             if sum(info.file_size for info in infos) > len(content):
                 raise ValueError("sizes do not add up")
+            names = [info.filename.removesuffix(".npy") for info in infos]
+            for name in names:
+                parts = name.removeprefix(_ARRAY).split("/")
+                if len(name) > _MAX_NAME or not name.isprintable() or not parts[0] or ".." in parts:
+                    raise ValueError(f"it names an array {name[:80]!r}")
+            if len(set(names)) < len(names):
+                raise ValueError("it names an array twice")
             if archive.testzip() is not None:  # before NumPy parses a header that may have changed
                 raise ValueError("a checksum does not match")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            meta = json.loads(file["meta"].tobytes())
-            arrays = {name.removeprefix("array/"): file[name] for name in file.files if name != "meta"}
-        written = meta.pop("sha256")
-        if meta["format"] != FORMAT or written != _digest(meta, arrays):
-            raise ValueError("checksum")
-        segments = tuple(Segment(int(first), int(count), str(sha)) for first, count, sha in meta["segments"])
-        return Checkpoint(round=int(meta["round"]), arrays=arrays, data=dict(meta["data"]), segments=segments)
+            return dict(file)
+
+
+@contextlib.contextmanager
+def _garbled() -> Iterator[None]:
+    """Have anything that reading garbled bytes may raise be a ValueError."""
+    try:
+        yield
     except (zipfile.BadZipFile, KeyError, TypeError, AttributeError, OSError, EOFError, RecursionError,
             NotImplementedError, RuntimeError, MemoryError, SyntaxError, OverflowError, tokenize.TokenError,
             zlib.error) as error:  # fmt: skip
         raise ValueError(str(error)) from None
+
+
+def _count(value: object, what: str) -> int:
+    """A whole number that runs can reach. Raises ValueError for any other."""
+    if type(value) is not int or not 0 <= value < _MAX_COUNT:
+        raise ValueError(f"its {what} is {str(value)[:80]!r}")
+    return value
+
+
+def _checked_segment(first: object, count: object, sha256: object) -> Segment:
+    begin, length = _count(first, "piece's first transition"), _count(count, "piece's length")
+    if length < 1 or begin + length >= _MAX_COUNT:
+        raise ValueError(f"it names a piece of {length} transitions from {begin} on")
+    return Segment(begin, length, str(sha256))
+
+
+def _rows_under(checkpoint: Checkpoint) -> dict[str, tuple[int, str]]:
+    """Row file -> its size and SHA-256 when the checkpoint was written. Raises ValueError for what no run has."""
+    found = {}
+    with _garbled():
+        for name, (size, sha256) in checkpoint.data["files"].items():
+            if name not in ROW_FILES:
+                raise ValueError(f"it names a file {name[:80]!r} that runs do not have")
+            found[name] = (_count(size, f"{name}'s size"), str(sha256))
+    return found
 
 
 def _savez(buffer: io.BytesIO, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -377,7 +439,7 @@ class RunWriter:
             try:
                 self.ledger.checkpoints.mkdir(exist_ok=True)
                 for folder in (self.ledger.folder, self.ledger.checkpoints, self.ledger.replay):
-                    for left_behind in folder.glob(_TEMPORARY):  # by a process that was killed while it wrote
+                    for left_behind in folder.glob(TEMPORARIES):  # by a process that was killed while it wrote
                         left_behind.unlink()
             except BaseException:
                 self._lock.release()
@@ -444,7 +506,7 @@ class RunWriter:
     def _intact_or_refused(self, path: Path) -> bytes:
         """A file's content. Raises ValueError if it is gone, LedgerError if it may be intact but cannot be read now."""
         try:
-            return path.read_bytes()
+            return read_file(path)
         except FileNotFoundError:
             raise ValueError(f"{path.name} is missing") from None
         except OSError as error:
@@ -455,7 +517,7 @@ class RunWriter:
 
     def _point_at(self, name: str, content: bytes, checkpoint: Checkpoint) -> None:
         """Let the status name the checkpoint that is used, before another one that it may name is removed."""
-        sizes = {file: size for file, (size, _) in checkpoint.data["files"].items()}
+        sizes = {file: size for file, (size, _) in _rows_under(checkpoint).items()}
         if self.status is None or (self.status.checkpoint, self.status.committed) == (name, sizes):
             return
         self._write_status(
@@ -475,9 +537,7 @@ class RunWriter:
             if hashlib.sha256(content).hexdigest() != segment.sha256:
                 raise ValueError(f"{segment.name} has changed since")
         prefixes = {}
-        for name, (size, sha256) in checkpoint.data["files"].items():
-            if name not in ROW_FILES:
-                raise ValueError(f"it names a file {name!r} that runs do not have")
+        for name, (size, sha256) in _rows_under(checkpoint).items():
             path = self.ledger.folder / name
             content = self._intact_or_refused(path)[:size] if size or path.exists() else b""
             if len(content) < size:
@@ -489,7 +549,7 @@ class RunWriter:
 
     def _cut(self, prefixes: Mapping[str, bytes]) -> None:
         for name, content in prefixes.items():
-            with (self.ledger.folder / name).open("ab") as file:
+            with appending(self.ledger.folder / name) as file:
                 file.truncate(len(content))
                 file.flush()
                 os.fsync(file.fileno())
@@ -502,7 +562,7 @@ class RunWriter:
         with (
             _clear_errors(self.ledger.folder),
             self._lock.held(sign_of_life=False),
-            (self.ledger.folder / name).open("ab") as file,
+            appending(self.ledger.folder / name) as file,
         ):
             file.write(line)
         self._sizes[name] += len(line)
@@ -512,7 +572,7 @@ class RunWriter:
         """Make everything so far permanent. Raises RunLockedError if another process has taken the run over."""
         with _clear_errors(self.ledger.folder), self._lock.held():
             for name in ROW_FILES:
-                with (self.ledger.folder / name).open("ab") as file:
+                with appending(self.ledger.folder / name) as file:
                     os.fsync(file.fileno())
             files = {name: (self._sizes[name], self._hashes[name].hexdigest()) for name in ROW_FILES}
             about = {
@@ -548,9 +608,12 @@ class RunWriter:
         return segment
 
     def read_segment(self, segment: Segment) -> dict[str, NDArray[Any]]:
-        """The arrays of a piece whose checksum `restore` has verified."""
-        with np.load(self._segment_path(segment), allow_pickle=False) as file:
-            return dict(file)
+        """The arrays of a piece whose checksum `restore` has verified. Raises LedgerError if it is damaged since."""
+        path = self._segment_path(segment)
+        try:
+            return _decode_arrays(_read(path))
+        except ValueError as error:
+            raise LedgerError(f"{path} is damaged: {error}") from None
 
     def _drop_unnamed_segments(self) -> None:
         """Remove the pieces of replay buffers that no checkpoint names any more."""
@@ -615,7 +678,7 @@ def _clear_errors(folder: Path) -> Iterator[None]:
 
 
 def _refuse(folder: Path, error: OSError) -> NoReturn:
-    what = {
+    what = why_not_own(error) or {
         errno.ENOSPC: "the disk is full",
         errno.EDQUOT: "the disk quota is used up",
         errno.EROFS: "the file system is read-only",
@@ -684,28 +747,26 @@ def _started(pid: int) -> int | None:
 
 
 class Lock:
-    """Ownership of a run, in a file whose every reading and writing happens under `flock`."""
+    """Ownership of a run, in a file whose every reading and writing happens under `flock`.
+
+    Only the process that made this object can use it; what was forked from that process is told so.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._me = this_process()
+        self._me, self._pid = this_process(), os.getpid()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+        self._turn = threading.Lock()  # our threads wait for each other as long as it takes, for others they do not
 
     @contextlib.contextmanager
-    def _locked_file(self) -> Iterator[io.BufferedRandom]:
-        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
-        with os.fdopen(descriptor, "r+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+    def _locked_file(self, seconds: float) -> Iterator[io.BufferedRandom]:
+        with self._turn, locked(self._path, seconds) as file:
             yield file
 
     def _read(self, file: io.BufferedRandom) -> dict[str, Any]:
         file.seek(0)
-        try:
-            owner = json.loads(file.read(_MAX_STATUS_BYTES) or b"{}")
-        except (ValueError, RecursionError):
-            return {}
-        return owner if isinstance(owner, dict) else {}
+        return _decoded_owner(file.read(_MAX_STATUS_BYTES))
 
     def _write(self, file: io.BufferedRandom, **extra: Any) -> None:
         content = json.dumps({**self._me, "heartbeat": time.time(), **extra}).encode()
@@ -719,22 +780,33 @@ class Lock:
         return not owner.get("released") and all(owner.get(key) == value for key, value in self._me.items())
 
     def acquire(self) -> None:
-        with self._locked_file() as file:
-            owner = self._read(file)
-            if believed_alive(owner):
-                raise RunLockedError(
-                    f"{self._path.parent} is being worked on by process {owner.get('pid')} on {owner.get('host')}. "
-                    "Wait for it to end, or stop it; if it is on a machine that died, its claim ends "
-                    f"{LEASE_SECONDS:.0f} s after its last sign of life"
-                )
-            try:
-                self._write(file)
-            except OSError:  # a claim that may not be on disk is none: whoever tries again must not meet it
-                with contextlib.suppress(OSError):
-                    file.truncate(0)
-                raise
+        """Become the owner. Raises RunLockedError if somebody else is, or does not let go of the file."""
+        try:
+            with self._locked_file(CLAIM_SECONDS) as file:
+                self._claim(file)
+        except TimeoutError as error:
+            with contextlib.suppress(OSError):
+                self._refuse(_owner(self._path), f", and has been in the middle of a write for {CLAIM_SECONDS:.0f} s")
+            raise RunLockedError(f"cannot claim {self._path.parent}: {error.strerror}") from None
         self._thread = threading.Thread(target=self._beat, name="lock-heartbeat", daemon=True)
         self._thread.start()
+
+    def _claim(self, file: io.BufferedRandom) -> None:
+        self._refuse(self._read(file))
+        try:
+            self._write(file)
+        except OSError:  # a claim that may not be on disk is none: whoever tries again must not meet it
+            with contextlib.suppress(OSError):
+                file.truncate(0)
+            raise
+
+    def _refuse(self, owner: Mapping[str, Any], more: str = "") -> None:
+        if believed_alive(owner):
+            raise RunLockedError(
+                f"{self._path.parent} is being worked on by process {owner.get('pid')} on {owner.get('host')}{more}. "
+                "Wait for it to end, or stop it; if it is on a machine that died, its claim ends "
+                f"{LEASE_SECONDS:.0f} s after its last sign of life"
+            )
 
     def _beat(self) -> None:
         while not self._stop.wait(HEARTBEAT_SECONDS):
@@ -744,8 +816,20 @@ class Lock:
 
     @contextlib.contextmanager
     def held(self, *, sign_of_life: bool = True) -> Iterator[None]:
-        """Do something that only the owner may do. Raises RunLockedError if that is no longer us."""
-        with self._locked_file() as file:
+        """Do something that only the owner may do. Raises RunLockedError if that is no longer us, or never was."""
+        if self._forked:
+            raise RunLockedError(
+                f"{self._path.parent} is process {self._pid}'s; this process, {os.getpid()}, is a copy of it, "
+                "forked by the environment or by a library, and changes nothing"
+            )
+        with contextlib.ExitStack() as stack:
+            try:
+                file = stack.enter_context(self._locked_file(OWNER_SECONDS))
+            except TimeoutError as error:
+                raise RunLockedError(
+                    f"cannot write to {self._path.parent}: {error.strerror}. What was committed is intact; once the "
+                    "lock is free, --resume continues"
+                ) from None
             owner = self._read(file)
             if not self._is_mine(owner):
                 who = f"process {owner.get('pid')} on {owner.get('host')}" if owner.get("host") else "somebody else"
@@ -755,10 +839,17 @@ class Lock:
                 self._write(file)
             yield
 
+    @property
+    def _forked(self) -> bool:
+        return os.getpid() != self._pid
+
     def release(self) -> None:
+        """Give it up, if it is ours."""
+        if self._forked:
+            return
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
-            with contextlib.suppress(OSError), self._locked_file() as file:
+            with contextlib.suppress(OSError), self._locked_file(OWNER_SECONDS) as file:
                 if self._is_mine(self._read(file)):
                     self._write(file, released=True)

@@ -26,7 +26,9 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, Patience, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
-from space_dist.ledger import Ledger, atomic_write, owner_alive
+from space_dist.files import atomic_write
+from space_dist.ledger import Ledger, owner_alive
+from space_dist.tracking_uri import checked_uri
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -96,7 +98,7 @@ class GridTracking(Section):
     @field_validator("uri")
     @classmethod
     def _known_kind(cls, value: str | None) -> str | None:
-        return configs.checked_uri(value)
+        return None if value is None else checked_uri(value)
 
 
 Axes = dict[str, list[Any]]

@@ -22,7 +22,7 @@ from space_dist.cluster import Handle, InProcess
 from space_dist.config import RunConfig
 from space_dist.envs import BatchedEnv
 from space_dist.envs.interface import Closable
-from space_dist.errors import SpaceDistError
+from space_dist.errors import SpaceDistError, exits_refused
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, begun, speaking
 from space_dist.learner import CoupledLearner, PopulationLearner, learn_together
@@ -194,7 +194,8 @@ class _Workshop:
         for batch, promised in batches.items():
             for some in _parts(promised):
                 try:
-                    self._compute(batch, some)
+                    with exits_refused():
+                        self._compute(batch, some)
                 except Exception:  # somebody's environment may raise anything: whose was it?
                     self._compute_apart(batch, some)
 
@@ -213,7 +214,8 @@ class _Workshop:
         for promise in promised:
             self.close()  # nobody knows what state an environment is in that has failed
             try:
-                self._compute(batch, [promise])
+                with exits_refused():
+                    self._compute(batch, [promise])
             except Exception as error:
                 promise.value = error
         self.close()

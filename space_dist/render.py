@@ -30,9 +30,10 @@ from space_dist.envs.cartpole import ANGLE_LIMIT, X_LIMIT
 from space_dist.envs.observations import take
 from space_dist.envs.pointmass import GOAL, POSITION_LIMIT, SUCCESS_DISTANCE
 from space_dist.errors import ConfigError, LedgerError
+from space_dist.files import atomic_write
 from space_dist.instances import InstanceSet, read_csv
 from space_dist.launch import policy_of
-from space_dist.ledger import Ledger, atomic_write
+from space_dist.ledger import Ledger
 from space_dist.mazes import CELLS, SIDE, shortest_ways, successors
 from space_dist.policy import Policy, members_of
 from space_dist.rollout import Split

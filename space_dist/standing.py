@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from space_dist.errors import LedgerError
+from space_dist.files import in_words, open_own
 from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, process_of, this_process
 from space_dist.manifest import Grid, Manifest, Retry, Run
 
@@ -114,7 +115,7 @@ class Attempts:
     def _append(self, row: Row) -> None:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("a+b") as file:
+            with os.fdopen(open_own(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT), "a+b") as file:
                 line = encode_row({**row, "unix_time": time.time()})
                 size = file.seek(0, os.SEEK_END)
                 if size:
@@ -125,7 +126,7 @@ class Attempts:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise LedgerError(f"cannot write {self.path}: {error.strerror}") from None
+            raise LedgerError(f"cannot write {self.path}: {in_words(error)}") from None
 
     def rows(self) -> list[Row]:
         """Every intact row."""

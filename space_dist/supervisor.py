@@ -36,10 +36,11 @@ import psutil
 
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
+from space_dist.files import open_own
 from space_dist.importing import look_here_too
 from space_dist.interrupts import StopRequests
 from space_dist.manifest import Grid, Manifest, Run, RunResources
-from space_dist.standing import Attempts, Cause, Ended, last_lines, slurm_job
+from space_dist.standing import Attempts, Cause, Ended, is_done, last_lines, slurm_job
 
 OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
@@ -137,7 +138,8 @@ class Supervisor:
         for run in runs:
             said = child.said.get(run.key)
             if said is not None and said["code"] == 0:
-                found[run.key] = Ended(None)
+                done = is_done(grid.ledger(run))  # an exit code proves nothing
+                found[run.key] = Ended(None) if done else Ended(Cause.CRASH, "it said that it was done, and is not")
             elif said is not None and said["error"] == RunLockedError.__name__:
                 found[run.key] = Busy(None, said["message"])
             else:
@@ -334,7 +336,7 @@ def _why(code: int, said: Mapping[str, Any], grid: Grid, system_killed: bool) ->
         return Ended(Cause.KILLED, "SIGKILL")
     if code < 0:
         return Ended(Cause.CRASH, f"ended by {signal.Signals(-code).name}")
-    return Ended(Cause.CRASH, message or (f"exit code {code}" if code else "its process ended without a word"))
+    return Ended(Cause.CRASH, message or f"its process ended with exit code {code} and without a word")
 
 
 def _system_kills() -> int:
@@ -359,14 +361,17 @@ Tell = Callable[[Run, "SpaceDistError | None"], None]
 
 def _child_main(work: Callable[[Tell], None], output: Path, pipe: int) -> int:
     """The exit code: of its run's error; 0 if it has more, each of which has an end of its own."""
-    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    descriptor = open_own(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
     codes: list[int] = []
+    own = os.getpid()
 
     def tell(run: Run, error: SpaceDistError | None) -> None:
+        if os.getpid() != own:  # a copy that the run's environment has forked
+            return
         kind, message = "", ""
         if error is not None:
             print(f"space-dist: {error}", file=sys.stderr)

@@ -6,8 +6,10 @@ it happens every time.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -56,6 +58,14 @@ class Faulty(Line):
             time.sleep(60)
         if self._fault == "no_memory":
             raise MemoryError
+        if self._fault == "exit":
+            sys.exit(0)
+        if self._fault == "_exit":
+            os._exit(0)
+        if self._fault == "exit from C":
+            ctypes.CDLL(None)._exit(0)
+        if self._fault == "fork":
+            os.fork()
         if self._fault == "slow":
             time.sleep(60)
 

@@ -776,3 +776,16 @@ def test_differences_name_the_keys_and_both_values() -> None:
     assert set(found) >= {"curriculum.eta: 0.1 -> None", "curriculum.kind: space -> round_robin",
                           "learner.gamma: 0.95 -> 0.9", "seed: 0 -> 3"}  # fmt: skip
     assert all(line.startswith(("curriculum.", "learner.gamma", "seed")) for line in found)
+
+
+@pytest.mark.parametrize(
+    "uri", ["http:///", "http://[", "sqlite:///:memory:", "sqlite:///", "http://user:secret@host:5000",
+            "http://secret@host", "https://user:secret@[", "postgresql://user:secret@host/db", "mlruns"]
+)  # fmt: skip
+def test_tracking_uris_that_could_not_be_mirrored_to_are_refused_and_no_password_is_repeated(uri: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        configs.parse({"tracking": {"uri": uri}}, "run.yaml")
+    text = next(line for line in str(caught.value).splitlines() if "tracking.uri" in line)
+    assert "sqlite:////absolute/path/mlflow.db" in text
+    assert "secret" not in str(caught.value)
+    assert ("MLFLOW_TRACKING_PASSWORD" in text) == ("http" in uri and "secret" in uri and "[" not in uri)

@@ -439,6 +439,9 @@ def unharmed(supervised: Supervised, tmp_path_factory: pytest.TempPathFactory) -
         ("no_memory", Cause.OUT_OF_MEMORY, "MemoryError", {}),
         ("slow", Cause.TIMEOUT, "0.1 minutes", {"resources": {"minutes": 0.1, "grace_seconds": 1.0}}),
         ("stop", Cause.KILLED, "SIGSTOP", {}),
+        ("exit", Cause.CRASH, "tried to end the process (SystemExit: 0)", {}),
+        ("_exit", Cause.CRASH, "os._exit(0)", {}),
+        ("exit from C", Cause.CRASH, "exit code 0 and without a word", {}),
     ],
 )  # fmt: skip
 def test_causes_are_told_apart_and_retries_finish_the_run(
@@ -456,6 +459,29 @@ def test_causes_are_told_apart_and_retries_finish_the_run(
     assert again["cause"] is None, again
     assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
     assert grid.ledger(run).rows(METRICS) == unharmed
+
+
+def test_a_run_whose_environment_forks_is_done_once(
+    supervised: Supervised, unharmed: list[Row], tmp_path: Path
+) -> None:
+    grid, manifest, run = faulty(tmp_path, "fork", str(tmp_path / "marker"))
+    assert supervised.attempt(grid, run)["cause"] is None
+    assert (tmp_path / "marker").exists()
+    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
+    assert grid.ledger(run).rows(METRICS) == unharmed
+
+
+def test_nobody_is_believed_to_be_done_whose_ledger_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, manifest, run = faulty(tmp_path, "none")
+
+    def lies(*arguments: Any) -> None:
+        arguments[-1](run, None)
+
+    monkeypatch.setattr(supervisor, "_work", lies)
+    folder, attempt = str(grid.folder), supervisor.Turn(run.cell.id, run.seed, 1)
+    [ended] = supervisor.Supervisor().attempt(supervisor.Task(folder, (attempt,)), lambda: None)
+    assert (ended.cause, "and is not" in ended.detail) == (Cause.CRASH, True)
+    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "failed"
 
 
 def test_a_run_that_others_work_on_is_left_alone(supervised: Supervised, tmp_path: Path) -> None:

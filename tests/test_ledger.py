@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import fcntl
 import io
 import json
 import os
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import time
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
@@ -311,7 +313,7 @@ def arrays(draw: st.DrawFn) -> np.ndarray:
 @quick
 @given(
     round=st.integers(0, 10**9),
-    named=st.dictionaries(st.from_regex(r"[a-z][a-z/._0-9]{0,8}", fullmatch=True), arrays(), max_size=3),
+    named=st.dictionaries(st.from_regex(r"[a-z](/?[a-z._0-9]?[a-z_0-9]){0,4}", fullmatch=True), arrays(), max_size=3),
     data=st.dictionaries(st.text(max_size=5), json_values, max_size=3),
 )
 def test_checkpoints_come_back_bit_by_bit(round: int, named: dict[str, np.ndarray], data: dict[str, Any]) -> None:
@@ -319,6 +321,73 @@ def test_checkpoints_come_back_bit_by_bit(round: int, named: dict[str, np.ndarra
     again = decode_checkpoint(encode_checkpoint(checkpoint))
     assert same(again, checkpoint, without=())
     assert again.data == data
+
+
+def forged(name: str = "array/weights", **changes: Any) -> bytes:
+    """A checkpoint whose hashes are right, and whose names or numbers are those of somebody who means ill."""
+    array, meta = np.zeros(3), {"round": 1, "data": {}, "segments": [], "format": 1, **changes}
+    meta["sha256"] = module._digest(meta, {name.removeprefix("array/"): array})
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for member, content in (("meta", np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)), (name, array)):
+            with archive.open(f"{member}.npy", "w") as file:
+                np.lib.format.write_array(file, content)
+    return buffer.getvalue()
+
+
+HASH = "0" * 64
+ELSEWHERE_NAMED: list[dict[str, Any]] = [
+    *({"name": name} for name in ("array/../../x", "array//etc/passwd", "../../x", "/etc/passwd", "weights",
+                                  "array/a/../b", "array/x\ny", "array/" + "x" * 1000)),
+    *({"segments": [segment]} for segment in ([-1, 5, HASH], [0, -5, HASH], [0, 0, HASH], [10**12, 1, HASH],
+                                              [0, 10**30, HASH], [1.5, 2, HASH], [True, 1, HASH], ["0", "1", HASH])),
+    *({"round": number} for number in (-1, 10**12, 1.5, True, "1", None)),
+]  # fmt: skip
+
+
+def test_an_honest_checkpoint_made_by_hand_is_read() -> None:
+    assert decode_checkpoint(forged(segments=[[0, 5, HASH]])).segments == (Segment(0, 5, HASH),)
+
+
+@pytest.mark.parametrize("change", ELSEWHERE_NAMED, ids=range(len(ELSEWHERE_NAMED)))
+def test_a_checkpoint_that_names_what_no_run_has_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"it names|it holds|its "):
+        decode_checkpoint(forged(**change))
+
+
+FILES_ELSEWHERE: list[dict[str, Any]] = [
+    {"../../x": [0, HASH]}, {"/etc/passwd": [0, HASH]}, {METRICS: [-1, HASH]}, {METRICS: [1.5, HASH]},
+    {METRICS: [10**30, HASH]}, {METRICS: 3}, {METRICS: ["x", HASH]},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("files", [*FILES_ELSEWHERE, None], ids=range(len(FILES_ELSEWHERE) + 1))
+def test_a_checkpoint_over_files_that_no_run_has_is_not_resumed(ledger: Ledger, files: dict[str, Any] | None) -> None:
+    for path in ledger.checkpoint_files():
+        path.write_bytes(forged(data={} if files is None else {"files": files}))
+    before = contents(ledger.folder)
+    with RunWriter(ledger) as writer, pytest.raises(LedgerError, match="no checkpoint is intact"):
+        writer.restore()
+    assert {**contents(ledger.folder), "lock.json": b""} == {**before, "lock.json": b""}
+
+
+@pytest.mark.parametrize("change", [{"checkpoint": "../../x.npz"}, {"checkpoint": "/etc/passwd"},
+                                    {"files": {"../../x": [HASH]}}, {"files": {"/etc/passwd": [HASH]}}],
+                         ids=range(4))  # fmt: skip
+def test_a_status_that_names_files_elsewhere_is_damaged(ledger: Ledger, change: dict[str, Any]) -> None:
+    status = {**dataclasses.asdict(ledger.status()), **change}
+    crc = zlib.crc32(json.dumps(status, sort_keys=True).encode())
+    ledger.status_file.write_text(json.dumps({**status, "crc": crc}))
+    with pytest.raises(LedgerError, match="damaged"):
+        ledger.status()
+
+
+def test_a_piece_of_a_replay_buffer_is_no_bomb(ledger: Ledger) -> None:
+    with RunWriter(ledger) as writer:
+        segment = writer.write_segment(0, 1, {"w": np.zeros(4)})
+        np.savez_compressed(ledger.replay / segment.name, w=np.zeros(1_000_000))
+        with pytest.raises(LedgerError, match="compressed"):
+            writer.read_segment(segment)
 
 
 def test_a_checkpoint_cut_short_is_refused() -> None:
@@ -749,7 +818,7 @@ def test_rows_on_a_disk_that_refuses(ledger: Ledger, monkeypatch: pytest.MonkeyP
     with RunWriter(ledger) as writer:
         writer.restore()
         with monkeypatch.context() as patch:
-            patch.setattr(Path, "open", failing(number))
+            patch.setattr(module.os, "open", failing(number))
             with pytest.raises(LedgerError, match=said):
                 write_rounds(writer, 4, 4)
     assert restored(ledger) == 3
@@ -871,6 +940,154 @@ def test_a_stopped_owner_is_still_the_owner(ledger: Ledger, owner: subprocess.Po
     lock = lock_of(ledger)
     ledger.lock_file.write_text(json.dumps({**lock, "heartbeat": lock["heartbeat"] - 10 * LEASE_SECONDS}))
     refused(ledger)
+
+
+def test_a_copy_of_the_owner_changes_nothing(ledger: Ledger) -> None:
+    """The case: an environment forks, and the copy goes on as if it were the run."""
+    with RunWriter(ledger) as writer:
+        writer.restore()
+        append_round(writer, 4)
+        before = contents(ledger.folder)
+        said, tell = os.pipe()
+
+        def go_on_as_the_run() -> None:
+            for write in WRITES.values():
+                with pytest.raises(RunLockedError) as caught:
+                    write(writer)
+            with pytest.raises(RunLockedError):
+                append_round(writer, 5)
+            os.write(tell, str(caught.value).encode())
+            writer.__exit__(None, None, None)
+
+        assert in_a_fork(go_on_as_the_run) == 0
+        text = os.read(said, 10_000).decode()
+        assert f"is process {os.getpid()}'s" in text
+        assert "forked" in text
+        assert contents(ledger.folder) == before
+        assert ledger.owner_alive()
+        writer.commit(checkpoint_of(4), status_of(4))
+    assert ledger.rows(METRICS, committed_only=True) == rows_until(METRICS, 4)
+
+
+def test_a_copy_made_while_the_lock_was_taken_does_not_keep_it(ledger: Ledger) -> None:
+    go, start = os.pipe()
+    with RunWriter(ledger) as writer:
+        with writer._lock.held():
+            child = os.fork()
+            if child == 0:
+                os.close(start)
+                os.read(go, 1)
+                os._exit(0)
+        writer.set_status(status_of(3))
+    assert restored(ledger) == 3
+    os.close(start)
+    os.waitpid(child, 0)
+
+
+HOLD_IN_A_WRITE = """
+import os, signal, sys
+from space_dist.ledger import Ledger, RunWriter
+with RunWriter(Ledger(sys.argv[1])) as writer, writer._lock.held():
+    print("held", flush=True)
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
+
+def test_an_owner_stopped_in_a_write_is_told_in_a_sentence(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CLAIM_SECONDS", 0.1)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD_IN_A_WRITE, str(ledger.folder)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+        text = refused(ledger)
+    finally:
+        process.kill()
+        process.communicate()
+    assert f"process {process.pid} on" in text
+    assert "in the middle of a write" in text
+
+
+def test_a_lock_that_a_stranger_holds_is_told_in_a_sentence(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CLAIM_SECONDS", 0.1)
+    monkeypatch.setattr(module, "OWNER_SECONDS", 0.1)
+    with ledger.lock_file.open("rb") as stranger:
+        fcntl.flock(stranger, fcntl.LOCK_EX)
+        with pytest.raises(RunLockedError, match=r"cannot claim .*held its lock for 0 s \(`fuser"), RunWriter(ledger):
+            pass
+        fcntl.flock(stranger, fcntl.LOCK_UN)
+        with RunWriter(ledger) as writer:
+            writer.restore()
+            fcntl.flock(stranger, fcntl.LOCK_EX)
+            for write in WRITES.values():
+                with pytest.raises(RunLockedError, match="held its lock"):
+                    write(writer)
+            fcntl.flock(stranger, fcntl.LOCK_UN)
+            writer.set_status(status_of(3))
+    assert restored(ledger) == 3
+
+
+def test_only_the_owners_user_can_take_the_lock(ledger: Ledger, tmp_path: Path) -> None:
+    ledger.lock_file.chmod(0o644)  # as versions before left it
+    assert restored(ledger) == 3
+    with RunWriter(Ledger(tmp_path / "new")):
+        for path in (ledger.lock_file, tmp_path / "new" / "lock.json"):
+            assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_lock_that_cannot_be_read_is_judged_by_its_age(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_owner", failing(errno.EACCES))
+    assert ledger.owner_alive()
+    os.utime(ledger.lock_file, (time.time(), time.time() - LEASE_SECONDS - 1))
+    assert not ledger.owner_alive()
+
+
+def test_a_pipe_for_a_lock_keeps_nobody_waiting(ledger: Ledger) -> None:
+    ledger.lock_file.unlink()
+    os.mkfifo(ledger.lock_file)
+    assert not ledger.owner_alive()
+    with pytest.raises(LedgerError, match=r"lock\.json is no regular file"), RunWriter(ledger):
+        pass
+
+
+LINKS: dict[str, Callable[[Path, Path], None]] = {
+    "is a link": lambda path, target: path.symlink_to(target),
+    "hard link": lambda path, target: path.hardlink_to(target),
+    "no regular file": lambda path, target: os.mkfifo(path),
+}
+
+
+@pytest.mark.parametrize("kind", LINKS)
+@pytest.mark.parametrize("name", ["lock.json", *ROW_FILES, ".status.json.tmp", ".config.yaml.tmp"])
+def test_nothing_is_written_through_a_link(ledger: Ledger, tmp_path: Path, name: str, kind: str) -> None:
+    target = tmp_path / "precious"
+    path, precious = ledger.folder / name, list[bytes]()
+
+    def put() -> None:
+        content = path.read_bytes() if path.exists() else b"precious"
+        path.unlink(missing_ok=True)
+        target.write_bytes(content)
+        precious.append(content)
+        LINKS[kind](path, target)
+
+    def write() -> None:
+        if name == "lock.json":
+            put()
+        with RunWriter(ledger) as writer:
+            if name != "lock.json":
+                put()
+            writer.restore()
+            writer.write_config("a", "b", "c")
+            writer.set_status(status_of(3))
+
+    with pytest.raises(LedgerError) as caught:
+        write()
+    assert f"{name} " in str(caught.value)
+    assert kind in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert target.read_bytes() == precious[0]
 
 
 def test_the_same_process_cannot_own_a_run_twice(ledger: Ledger) -> None:

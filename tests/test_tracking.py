@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import gzip
 import hashlib
 import logging
 import shutil
-from collections.abc import Callable
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import mlflow
+import psutil
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
@@ -18,8 +25,10 @@ from mlflow.entities import Run
 from space_dist.errors import ConfigError
 from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
 from space_dist.report import figures
-from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, follow, sync
+from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, answers, follow, sync
 from space_dist.tracking import runs as tracked_runs
+from space_dist.tracking.pusher import ended_within
+from tests.patience import PATIENCE
 from tests.test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
 
 TEST = [-10.0, -8.0, -6.0, -4.0, 1.0]
@@ -234,9 +243,86 @@ def test_a_dead_server_costs_nothing(tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
+def answered(write: Callable[[socket.socket], None]) -> Iterator[str]:
+    """A server that answers every connection so, until the other side has gone."""
+
+    def serve() -> None:
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            threading.Thread(target=answer, args=(connection,), daemon=True).start()
+
+    def answer(connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):
+            connection.recv(1 << 16)
+            write(connection)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+
+
+def drip(connection: socket.socket) -> None:
+    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n{")
+    while True:
+        connection.sendall(b" ")
+        time.sleep(0.05)
+
+
+def drip_headers(connection: socket.socket) -> None:
+    connection.sendall(b"HTTP/1.1 200 OK\r\nX: ")
+    while True:
+        connection.sendall(b"x")
+        time.sleep(0.05)
+
+
+def too_many(connection: socket.socket) -> None:
+    connection.sendall(b"HTTP/1.1 429 Too Many\r\nRetry-After: 1000\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
+
+
+def bomb(connection: socket.socket) -> None:
+    content = gzip.compress(b" " * (answers.MAX_BYTES + (1 << 20)), 9)
+    head = f"HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\nContent-Length: {len(content)}\r\n\r\n"
+    connection.sendall(head.encode() + content)
+    connection.recv(1)
+
+
+@pytest.mark.parametrize(
+    ("server", "words"),
+    [(drip, "too long|no whole answer"), (drip_headers, "no whole answer"), (too_many, "Max retries exceeded"),
+     (bomb, "larger than 64 MiB")],
+)  # fmt: skip
+def test_a_server_that_answers_badly_is_given_up(
+    server: Callable[[socket.socket], None], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them would hold a request for ever, or for as long as there is memory."""
+    monkeypatch.setattr(answers, "SECONDS", 60.0 if server in (bomb, too_many) else 3.0)
+    ledger = start_run(tmp_path / "run")
+    serving = answered(server)
+    with pytest.raises(TrackingError, match=words):
+        sync([ledger], next(serving), "tests")
+    assert next(serving, None) is None
+
+
+def test_a_pusher_that_takes_too_long_is_ended_with_all_that_it_started() -> None:
+    script = "sleep 1000 & echo $!; wait"
+    with subprocess.Popen(["bash", "-c", script], stdout=subprocess.PIPE, start_new_session=True) as process:
+        assert process.stdout is not None
+        child = psutil.Process(int(process.stdout.readline()))
+        assert not ended_within(process, 0.0)
+        assert process.poll() is not None
+        psutil.wait_procs([child], timeout=PATIENCE)
+        assert not child.is_running() or child.status() == psutil.STATUS_ZOMBIE
+
+
 @pytest.mark.parametrize(
     "store", ["file:///srv/mlruns", "mlruns", "/srv/mlruns", "", "sqlite://", "sqlite:///:memory:", "sqlite:mlflow.db",
-              "postgresql://user:word@host/db", "http://user:word@host:5000", "http://[", "databricks"]
+              "postgresql://user:word@host/db", "http://user:word@host:5000", "http://[", "databricks",
+              "http:///", "https://:5000", "http://host:99999", "http://host:0", "http://user:word@[", "http://a b/",
+              "http://host/?token=word@", "sqlite:///folder/", "sqlite://user:word@host/db"]
 )  # fmt: skip
 def test_other_stores_are_refused(tmp_path: Path, store: str) -> None:
     with pytest.raises(ConfigError, match=r"sqlite:////absolute|MLFLOW_TRACKING_PASSWORD") as refusal:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from space_dist.cli.terminal import warn  # isort: skip - before anything heavy
+from space_dist.cli.terminal import keep_outputs, warn  # isort: skip - before anything heavy
 
 import os
 import sys
@@ -32,6 +32,7 @@ app.add_typer(env_app, name="env")
 
 def main() -> None:
     """Run a command; every error that a user can cause ends it with one sentence and its exit code."""
+    keep_outputs()
     look_here_too()  # import paths in configs may name the user's own modules
     try:
         app()

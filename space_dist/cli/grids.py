@@ -16,8 +16,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from space_dist.cli.terminal import STOP, Json, console, one_of, say, warn
+from space_dist.cli.terminal import STOP, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.files import LogFile
 
 if TYPE_CHECKING:
     from ray.job_submission import JobDetails
@@ -203,7 +204,7 @@ def grid_status(
             _print_cells(manifest, found)
             _print_failures(found, by_cause)
             say(_summary(manifest, found) + _workers_in_words(place, queue))
-        if not watch or all(standing.condition in ("done", "failed") for standing in found):
+        if not watch or output_left() or all(standing.condition in ("done", "failed") for standing in found):
             raise typer.Exit(exit_code(found))
         time.sleep(_WATCH_SECONDS)
 
@@ -227,7 +228,7 @@ def grid_logs(
         [standing] = _standings(place, manifest, [run])
         for path in offsets:
             offsets[path] = _print_from(path, offsets[path])
-        if not follow or standing.condition in ("done", "failed"):
+        if not follow or output_left() or standing.condition in ("done", "failed"):
             break
         time.sleep(_WATCH_SECONDS)
     warn(f"{run.title}: {standing.in_words}, {standing.steps:,} of {standing.budget_steps:,} steps. {ledger.folder}")
@@ -413,7 +414,7 @@ def _log_to(place: Grid) -> None:
     log = logging.getLogger("space_dist")
     log.setLevel(logging.INFO)
     with contextlib.suppress(OSError):
-        handler = logging.FileHandler(place.log)
+        handler = LogFile(place.log)
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
         log.addHandler(handler)
 
@@ -575,6 +576,7 @@ def _remote_status(place: Grid, manifest: Manifest, address: str) -> int:
 
 def _print_json(data: dict[str, Any]) -> None:
     print(json.dumps(data, indent=1))
+    delivered()
 
 
 def _print_from(path: Path, offset: int) -> int:

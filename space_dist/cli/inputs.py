@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from space_dist.cli.terminal import Kwargs, Overrides, console, parse_kwargs, say, write
+from space_dist.cli.terminal import Kwargs, Overrides, console, delivered, parse_kwargs, say, write
 from space_dist.errors import ConfigError, about
 
 instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
@@ -86,6 +86,7 @@ def config_schema() -> None:
             required = " (required)" if default == "required" else ""
             console.print(f"  [bold]{key}[/bold]: {escape(about_it)}{required}", highlight=False)
             console.print(Padding(escape(text), (0, 0, 0, 6)), highlight=False)
+    delivered()
 
 
 @config_app.command("check")
@@ -102,3 +103,4 @@ def config_check(
     with about(str(config)):
         make_setup(run, *read_instances(run))
     print(configs.dump(run), end="")
+    delivered()

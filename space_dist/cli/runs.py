@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from space_dist.cli.terminal import STOP, Json, Overrides, console, say, warn, write
-from space_dist.errors import ConfigError, about
+from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, say, warn, write
+from space_dist.errors import ConfigError, about, exits_refused
 
 if TYPE_CHECKING:
     from space_dist.manifest import Grid
@@ -85,13 +85,15 @@ def evaluate(
 
     ledger = Ledger(run)
     status = ledger.status()
+    state = "abandoned" if ledger.abandoned(status) else status.state
     config = stored_config(ledger)
     policies = members_of(policy_of(ledger))
     chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
     env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    outcomes = [evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])[0]
-                for policy in policies]  # fmt: skip
+    with exits_refused():
+        outcomes = [evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])[0]
+                    for policy in policies]  # fmt: skip
     names = {"return": "returns", "discounted_return": "discounted_returns", "length": "lengths", "success": "success"}
     columns = {  # over all policies, where the run trains several
         column: np.mean([getattr(outcome, name) for outcome in outcomes], axis=0) for column, name in names.items()
@@ -106,15 +108,18 @@ def evaluate(
         lines = [f"id,{','.join(columns)}", *(",".join(map(str, row)) for row in rows)]
         write(out, "\n".join(lines) + "\n")
     if as_json:
-        print(json.dumps({"run": str(run), "steps": status.steps, "state": status.state, "instances": str(instances),
+        print(json.dumps({"run": str(run), "steps": status.steps, "state": state, "instances": str(instances),
                           "n_instances": len(chosen), **means}))  # fmt: skip
+        delivered()
         return
-    table = Table(title=f"{config.name}, seed {config.seed}, after {status.steps:,} steps ({status.state})")
+    table = Table(title=f"{config.name}, seed {config.seed}, after {status.steps:,} steps ({state})")
     for name in ("instances", *means):
         table.add_column(name.replace("_", " "), justify="right")
     shown = ["—" if value is None else f"{value:.3f}" for value in means.values()]
     table.add_row(str(len(chosen)), *shown)
     console.print(table)
+    if out is None:
+        delivered()
 
 
 def report(

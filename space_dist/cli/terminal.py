@@ -11,18 +11,82 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import contextlib
+import io
+import sys
+from typing import Any
+
+
+class _Output(io.FileIO):
+    """An output whose loss ends no work: once it is refused (a full disk, a reader that left), nothing more is written.
+
+    lost: why, once that is so.
+    """
+
+    lost: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        if self.lost is None:
+            try:
+                return super().write(data) or 0
+            except OSError as error:
+                self.lost = error
+        return memoryview(data).nbytes
+
+
+_outputs: dict[int, _Output] = {}  # by descriptor, of this process's own
+
+
+def keep_outputs() -> None:
+    """Have nothing that becomes of standard output and error decide how a command ends.
+
+    Where they are closed, their descriptors are taken: else the next file that is opened, a ledger's, would get what
+    libraries print.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest that is free
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, io.TextIOWrapper(io.FileIO(number, "w", closefd=False)))
+        elif stream is getattr(sys, f"__{name}__") and number not in _outputs:
+            stream.flush()
+            output = _outputs[number] = _Output(number, "w", closefd=False)
+            setattr(sys, name, io.TextIOWrapper(
+                io.BufferedWriter(output), encoding=stream.encoding, errors=stream.errors,
+                line_buffering=number == 2 or output.isatty(),
+            ))  # fmt: skip
+
+
+def output_left() -> bool:
+    """Whether the reader of standard output has left, so that nobody needs more of it."""
+    return 1 in _outputs and isinstance(_outputs[1].lost, BrokenPipeError)
+
+
+def delivered() -> None:
+    """For commands that are for their output. Raises SpaceDistError if it is lost, but not if its reader left."""
+    with contextlib.suppress(AttributeError):
+        sys.stdout.flush()
+    lost = _outputs[1].lost if 1 in _outputs else None
+    if lost is not None and not output_left():
+        raise SpaceDistError(f"standard output cannot be written: {lost.strerror}")
+
+
 from space_dist.interrupts import StopRequests
 
 STOP = StopRequests()
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import typer
 from rich.console import Console
 
-from space_dist.errors import ConfigError, nearest
+from space_dist.errors import ConfigError, SpaceDistError, nearest
 
 console = Console()
 errors = Console(stderr=True)

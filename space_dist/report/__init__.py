@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from space_dist.errors import ConfigError
-from space_dist.ledger import Ledger, atomic_write
+from space_dist.files import atomic_write
+from space_dist.ledger import Ledger
 from space_dist.report.document import Document, Picture, Section, to_markdown
 from space_dist.report.figures import draw_comparison, draw_contexts, draw_curriculum, draw_learning_curve, png, save
 from space_dist.report.grid_report import GridReport, build_grid_report

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from space_dist.errors import LedgerError
-from space_dist.ledger import atomic_write
+from space_dist.files import atomic_write
 from space_dist.report.load import Configuration, FloatArray, IntArray, Run
 from space_dist.report.statistics import bootstrap_interval, interquartile_mean
 

@@ -11,7 +11,7 @@ from typing import Final
 
 from space_dist.config import clean
 from space_dist.errors import ConfigError
-from space_dist.ledger import atomic_write
+from space_dist.files import atomic_write
 from space_dist.manifest import Grid, Manifest
 from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
 from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, draw_heat_map, draw_panels, png

@@ -311,7 +311,7 @@ def standing(run: Run) -> str:
     """Where a run stands, in words: `interrupted at 2,048 of 50,000 steps (SIGTERM)`."""
     status = run.status
     state: str = status.state
-    if state == "running" and not run.ledger.owner_alive():
+    if run.ledger.abandoned(status):
         state = "left behind by a process that is gone"
     reason = f" ({status.message.splitlines()[0][:200]})" if status.message else ""
     return f"{state} at {status.steps:,} of {status.budget_steps:,} steps{reason}"

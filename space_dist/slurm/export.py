@@ -20,7 +20,7 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from space_dist.config import clean
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.ledger import atomic_write
+from space_dist.files import atomic_write
 from space_dist.manifest import Grid, Manifest
 from space_dist.slurm.profile import Profile, variables_in
 

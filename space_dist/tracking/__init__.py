@@ -32,9 +32,9 @@ from space_dist.tracking.runs import (
     RefusedError,
     Store,
     TrackingError,
-    checked_uri,
     read_snapshot,
     store_errors,
+    usable_uri,
 )
 
 __all__ = [
@@ -197,7 +197,7 @@ class _Mirror:
     """
 
     def __init__(self, uri: str | None, experiment: str | None) -> None:
-        self._uri = None if uri is None else checked_uri(uri)
+        self._uri = None if uri is None else usable_uri(uri)
         self._experiment = experiment
         self._stores: dict[str, Store] = {}
         self._settled: dict[Path, tuple[Status, bool]] = {}
@@ -260,7 +260,7 @@ class _Mirror:
             return SyncResult(skipped=mirror.begun)
         created = rows = 0
         if mirror.changed:
-            store = self._store(uri if self._uri is not None else checked_uri(uri))
+            store = self._store(uri if self._uri is not None else usable_uri(uri))
             try:
                 created, rows = mirror.push(manifest, store, self._experiment or manifest.experiment)
             except RefusedError as error:
@@ -280,7 +280,7 @@ class _Mirror:
             return None
         if not isinstance(experiment, str):
             raise LedgerError(f"{ledger.config} names no tracking.experiment; give one")
-        return (uri if self._uri is not None else checked_uri(str(uri))), experiment
+        return (uri if self._uri is not None else usable_uri(str(uri))), experiment
 
     def _store(self, uri: str) -> Store:
         if uri not in self._stores:

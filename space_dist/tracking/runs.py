@@ -7,7 +7,6 @@ what dies in between pushes some points again, and MLflow keeps a point of the s
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import logging
@@ -20,11 +19,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import urlsplit
 
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
+from space_dist.files import in_words, locked
 from space_dist.importing import PYTHON
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
+from space_dist.place import absolute_uri
+from space_dist.tracking_uri import UriError, checked_uri
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -48,15 +49,12 @@ _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; ml
 _MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
-_DRAW_SECONDS: Final = 60.0  # for the pictures of a run
-_ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
-# MLflow's own defaults wait for a dead server for minutes, print a line a run and call home.
+_TURN_SECONDS: Final = 600.0  # a grid of thousands of runs takes minutes
+_DRAW_SECONDS: Final = 30.0  # for the pictures of a run
+# MLflow's own defaults print a line a run and call home.
 _ENVIRONMENT: Final = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",  # seconds
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
-    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
 }
 
 
@@ -531,32 +529,16 @@ def _whole_number(text: str) -> int:
     return int(text) if re.fullmatch(r"[0-9]{1,15}", text) else 0
 
 
-def checked_uri(uri: str) -> str:
+def usable_uri(uri: str) -> str:
     """The URI, with an absolute path if it is SQLite's. Raises ConfigError for a store that is not mirrored to."""
     try:
-        parts = urlsplit(uri)
-        host, has_credentials = parts.hostname, "@" in parts.netloc
-    except ValueError:
-        raise ConfigError(f"the tracking URI {uri!r} is not a URI; {_ALLOWED}") from None
-    if parts.scheme in ("http", "https") and host:
-        if has_credentials:
-            raise ConfigError(
-                f"the tracking URI for {host} contains credentials, which would be stored with every run; give them in "
-                "the environment: MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
-            )
-        return uri.rstrip("/")
-    if parts.scheme == "sqlite":
-        return f"sqlite:///{_database(uri)}"
-    if parts.scheme in ("", "file"):
-        raise ConfigError(f"the tracking URI {uri!r} is a folder of files, which MLflow no longer supports; {_ALLOWED}")
-    raise ConfigError(f"a tracking URI of the kind {parts.scheme}: cannot be mirrored to; {_ALLOWED}")
+        return str(absolute_uri(checked_uri(uri)))
+    except UriError as error:
+        raise ConfigError(str(error)) from None
 
 
 def _database(uri: str) -> Path:
-    name = uri.removeprefix("sqlite:///")
-    if name == uri or not name or name == ":memory:" or "?" in name:
-        raise ConfigError(f"the tracking URI {uri!r} names no database file; {_ALLOWED}")
-    return Path(name).absolute()
+    return Path(uri.removeprefix("sqlite:///"))
 
 
 def _new_client(uri: str) -> MlflowClient:
@@ -571,9 +553,7 @@ def _new_client(uri: str) -> MlflowClient:
 def _open_database(uri: str, database: Path) -> MlflowClient:
     """A client whose tables exist. Creating them is no transaction: two pushers at once would break each other."""
     database.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(database.parent / f".{database.name}.lock", os.O_RDWR | os.O_CREAT, 0o644)
-    with os.fdopen(descriptor) as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with _locked(database.parent / f".{database.name}.lock"):
         # MLflow would try for minutes to open a file that it can never write to.
         with contextlib.closing(sqlite3.connect(database, timeout=_DATABASE_WAIT_SECONDS)) as connection:
             connection.execute("BEGIN IMMEDIATE")
@@ -586,30 +566,26 @@ def _open_database(uri: str, database: Path) -> MlflowClient:
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold a file's lock, which the system takes back from whoever dies. Raises TrackingError if it cannot be had."""
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise TrackingError(f"cannot write {path}, by which pushers take turns: {error.strerror}") from None
-    with os.fdopen(descriptor) as file:
+    with contextlib.ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            log.warning("waiting for another process that pushes at this moment (%s)", path)
-            fcntl.flock(file, fcntl.LOCK_EX)
+            held.enter_context(locked(path, _TURN_SECONDS))
         except OSError as error:
-            raise TrackingError(f"cannot lock {path}, by which pushers take turns: {error.strerror}") from None
+            raise TrackingError(f"cannot lock {path}, by which pushers take turns: {in_words(error)}") from None
         yield
 
 
 @contextlib.contextmanager
 def store_errors(uri: str) -> Iterator[None]:
     """Run MLflow, and say what went wrong in our words. Raises TrackingError and RefusedError."""
-    for name, value in _ENVIRONMENT.items():
+    from space_dist.tracking import answers  # here: it imports requests
+
+    for name, value in {**_ENVIRONMENT, **answers.ENVIRONMENT}.items():
         os.environ.setdefault(name, value)  # MLflow reads some of them when it is imported: next
     import requests
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
+    answers.bound_answers()
     try:
         yield
     except MlflowException as error:

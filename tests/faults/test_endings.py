@@ -1,0 +1,121 @@
+"""Environments that end the process with 0, or double it, and outputs that nobody reads: what remains is true."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from space_dist import config as configs
+from space_dist.errors import SpaceDistError
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
+from space_dist.ledger import Ledger
+from space_dist.report import load_run
+from space_dist.report.load import standing
+from tests.patience import PATIENCE
+from tests.test_learners import config_for, learner_section, results
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def faulty(folder: Path, fault: str) -> configs.RunConfig:
+    """A run whose environment has a fault after 700 steps, once."""
+    env = {"id": "tests.fault_env:make", "kwargs": {"fault": fault, "marker": str(folder / "marker")}}
+    section = learner_section("ppo", n_steps=32, net_arch=[4])
+    return config_for(folder, section, env=env, budget={"steps": 960}, rollout={"shards": 2, "slots": 2})
+
+
+def train(folder: Path, fault: str, *, shell: str = "", **more: Any) -> subprocess.CompletedProcess[str]:
+    (folder / "config.yaml").write_text(configs.dump(faulty(folder, fault)))
+    command = [sys.executable, "-m", "space_dist.cli", "train", str(folder / "config.yaml"), "--resume",
+               "--out", str(folder / "run")]  # fmt: skip
+    if shell:
+        command = ["bash", "-c", f'set -o pipefail; "$@" {shell}', "bash", *command]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, **more)
+
+
+@pytest.fixture(scope="module")
+def unharmed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("unharmed")
+    launch(faulty(folder, "none"), folder / "run", resume=True, stop=StopRequests())
+    return results(folder / "run")
+
+
+@pytest.mark.parametrize(("fault", "words"), [("exit", "SystemExit: 0"), ("_exit", "os._exit(0)")])
+def test_an_exit_with_0_is_a_failure(
+    fault: str, words: str, unharmed: dict[str, bytes], tmp_path: Path
+) -> None:  # fmt: skip
+    done = train(tmp_path, fault)
+    assert done.returncode not in (0, 2, 75)
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    status = Ledger(tmp_path / "run").status()
+    assert status.state == "failed"
+    assert words in str(status.message)
+    assert train(tmp_path, fault).returncode == 0  # once is enough
+    assert results(tmp_path / "run") == unharmed
+
+
+def test_an_exit_from_c_leaves_a_run_that_is_seen_to_be_abandoned(unharmed: dict[str, bytes], tmp_path: Path) -> None:
+    assert train(tmp_path, "exit from C").returncode == 0  # nothing of Python's is asked
+    ledger = Ledger(tmp_path / "run")
+    assert ledger.abandoned(ledger.status())
+    assert "left behind by a process that is gone" in standing(load_run(ledger))
+    said = subprocess.run(
+        [sys.executable, "-m", "space_dist.cli", "evaluate", str(ledger.folder), "--json", "--instances",
+         str(tmp_path / "test.csv")], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE,
+    )  # fmt: skip
+    assert '"state": "abandoned"' in said.stdout
+    assert train(tmp_path, "exit from C").returncode == 0
+    assert results(tmp_path / "run") == unharmed
+
+
+def test_an_environment_that_forks_leaves_one_run(unharmed: dict[str, bytes], tmp_path: Path) -> None:
+    done = train(tmp_path, "fork")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "marker").exists()
+    assert results(tmp_path / "run") == unharmed
+    assert "forked by the environment" in done.stderr  # says the copy
+
+
+def test_what_is_stood_in_for_is_put_back(tmp_path: Path) -> None:
+    before, config = os._exit, faulty(tmp_path, "exit")
+    with pytest.raises(SpaceDistError, match="tried to end the process"):
+        launch(config, tmp_path / "run", resume=True, stop=StopRequests())
+    assert os._exit is before
+
+
+LINKED = ("log.txt", "lock.json")  # the others: tests/test_ledger.py
+
+
+@pytest.mark.parametrize("name", LINKED)
+def test_a_run_folder_with_a_link_is_refused_in_a_sentence(name: str, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).symlink_to(tmp_path / "precious")
+    done = train(tmp_path, "none")
+    assert done.returncode == 1
+    assert f"{name} is a link" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "precious").read_text() == "precious"
+
+
+@pytest.mark.parametrize("shell", [">/dev/full", "| head -0", ">&- 2>&-"])
+def test_work_that_is_done_ends_with_0_whatever_became_of_its_output(shell: str, tmp_path: Path) -> None:
+    done = train(tmp_path, "none", shell=shell)
+    assert done.returncode == 0, done.stderr
+    assert Ledger(tmp_path / "run").status().state == "done"
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(("shell", "code"), [(">/dev/full", 1), ("| head -1", 0), (">/dev/null", 0)])
+def test_a_command_that_is_for_its_output_says_that_it_is_lost(shell: str, code: int) -> None:
+    command = f"set -o pipefail; {sys.executable} -m space_dist.cli config schema {shell}"
+    done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == code
+    assert done.stderr == ("space-dist: standard output cannot be written: No space left on device\n" if code else "")
