@@ -77,9 +77,8 @@ def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
     few = few_seeds({summary.label: summary.test.n for summary in summaries})
     notes = [line for configuration in configurations for line in remarks(configuration)]
     picture = Picture("report.png", "Learning curves and set sizes", png(draw_comparison(configurations)))
-    document = Document(
-        "Report", [Section("", few, rows=table, items=notes, pictures=[picture]), Section("How to read this", [_METHOD])]
-    )
+    found = Section("", few, table, notes, [picture])
+    document = Document("Report", [found, Section("How to read this", [_METHOD])])
     markdown = to_markdown(document)
     try:
         out.mkdir(parents=True, exist_ok=True)

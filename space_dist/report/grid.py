@@ -152,7 +152,9 @@ def compare(cells: Sequence[CellRuns], baseline: CellRuns, threshold: float | No
     tested = {number: reach for number, comparison in enumerate(found) if (reach := comparison.reach) is not None}
     means = intervals([restricted(reach.times, reach.budget) for reach in tested.values()], "mean")  # all cells at once
     for (number, reach), interval in zip(tested.items(), means, strict=True):
-        found[number] = dataclasses.replace(found[number], reach=dataclasses.replace(reach, mean=interval.within(0.0, reach.budget)))
+        found[number] = dataclasses.replace(
+            found[number], reach=dataclasses.replace(reach, mean=interval.within(0.0, reach.budget))
+        )
     return found
 
 

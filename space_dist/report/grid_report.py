@@ -31,7 +31,7 @@ from space_dist.report.grid import (
     varying,
 )
 from space_dist.report.load import Configuration
-from space_dist.report.statistics import Interval
+from space_dist.report.statistics import FEWEST, Interval
 from space_dist.report.tables import (
     NONE,
     Value,
@@ -52,17 +52,17 @@ MAX_LISTED: Final = 100  # failures, remarks
 _CURVES_PER_PANEL: Final = 6
 _METHOD: Final = tuple(
     " ".join(paragraph.split())
-    for paragraph in """
+    for paragraph in f"""
 Round brackets say how many of a cell's seeds a number rests on: (9/10) are nine finished seeds of ten. Runs that are
 not finished count in no number.
 
 Final returns are undiscounted means over the held-out (test) instances at each finished run's last step. IQM:
 interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are to cover 95 %: from
 Student's t and winsorised values, over the seeds of a cell; where cells are pooled, from the spread within each cell
-(stratified). Below three seeds, where seeds do not differ, and where a final return is no number, there is none.
+(stratified). Below {FEWEST} seeds, where seeds do not differ, and where a final return is no number, there is none.
 
 P(better) is the probability that a seed of the cell ends above a seed of the baseline, over all pairs of seeds, a tie
-counting one half; its interval is that of Newcombe (2006), method 5.
+counting one half; its interval is that of Newcombe (2006), method 5, with Student's t.
 
 A threshold is reached at the first of three consecutive evaluations of the test return at or above it. Seeds that do
 not reach it within their budget are censored: they count as the budget in the restricted mean, which is a lower bound
