@@ -19,7 +19,8 @@ KLINK_2020 = {"learner.target_kl": 0.004, "learner.learning_rate": 0.239}
 RIVALS = {**PAPER, "learner.kind": "ppo", "learner.n_steps": 2048, "learner.n_epochs": 10, "learner.batch_size": 64,
           "learner.net_arch": (64, 64), "learner.learning_rate": 3e-4}  # fmt: skip
 SPDRL = {"curriculum.initial_mean": (0.0, 4.25, 2.0), "curriculum.initial_std": (2.0, 1.875, 1.0),
-         "curriculum.zeta": 1.6, "curriculum.epsilon": 0.05, "curriculum.warm_up": 5, "env.context_visible": True}  # fmt: skip
+         "curriculum.zeta": 1.6, "curriculum.epsilon": 0.05, "curriculum.warm_up": 5,
+         "env.context_visible": True}  # fmt: skip
 TARGET = {"curriculum.target_mean": (2.5, 0.5, 0.0), "curriculum.target_std": (4e-3, 3.75e-3, 2e-3),
           "curriculum.least_std": (0.2, 0.1875, 0.1), "curriculum.least_std_until": 8000.0}  # fmt: skip
 NOTEBOOK = {
