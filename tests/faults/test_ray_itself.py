@@ -22,8 +22,8 @@ from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 IMPATIENT = (
-    "import sys; from space_dist import ray_watch as watch; watch.SILENT_SECONDS = 8.0; watch._ASK_SECONDS = 2.0; "
-    "from space_dist.cli import main; main(sys.argv[1:])"
+    "from space_dist import ray_watch as watch; watch.SILENT_SECONDS = 8.0; watch._ASK_SECONDS = 2.0; "
+    "from space_dist.cli import main; main()"
 )
 RUN = ["train", str(ROOT / "configs/pointmass_space.yaml"), "--workers", "1"]
 SMALL = ["learner.n_steps=512", "rollout.slots=1", "evaluation.every_steps=1000000", "tracking.uri=null"]
