@@ -5,7 +5,7 @@ from __future__ import annotations
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
 import typer
-from benchmarks import chaos, checkpoint, curricula, curriculum, envs, equivalence, grid, throughput
+from benchmarks import chaos, checkpoint, coverage, curricula, curriculum, envs, equivalence, grid, throughput
 from rich.console import Console
 
 from space_dist.errors import SpaceDistError
@@ -14,6 +14,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 for _benchmark in (
     chaos.chaos,
     checkpoint.checkpoint,
+    coverage.coverage,
     curricula.curricula,
     curriculum.curriculum,
     envs.envs,

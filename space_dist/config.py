@@ -573,7 +573,8 @@ class DQNConfig(_OffPolicy):
     exploration_fraction: float = Field(default=0.1, ge=0.0, le=1.0)
     """Share of the run over which epsilon falls. Source: SB3."""
     exploration_initial_eps: float = Field(default=1.0, ge=0.0, le=1.0)
-    """Probability of a random action at the start. Source: SB3."""
+    """Probability of a random action at the start. Source: SB3. Before `learning_starts` all actions are random, so of
+    the schedule only what lies behind it acts, and is logged."""
     exploration_final_eps: float = Field(default=0.05, ge=0.0, le=1.0)
     """Probability of a random action in the end. Source: SB3."""
     max_grad_norm: float | None = Field(default=10.0, gt=0.0)

@@ -19,7 +19,7 @@ import statistics
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -40,6 +40,7 @@ from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
+from space_dist.ray_watch import JOIN_SECONDS, START_SECONDS, Started, bounded, parts, reach, watched
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
 
 _OBJECT_STORE_BYTES = 256 << 20
@@ -146,12 +147,14 @@ class RayCluster:
         self._submitted = 0
         self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_REMEMBERED))
         self._session: str | None = None  # the folder of a Ray of our own
+        self._watch = contextlib.ExitStack()  # over Ray itself, as long as it is ours to use
         self._clock = 0.0  # seconds spent waiting: a driver that was itself stopped, or busy, blames nobody
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
         found = join_ray(resources.address, resources.workers + 1, self._heed)
         self._session = found["session_dir"] if resources.address == "local" else None
+        self._watch.enter_context(attended(found, resources.address, gone=True))
         try:
             self._setup_piece = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
@@ -161,6 +164,7 @@ class RayCluster:
                 self._look_after_starting()
         except BaseException:
             ray.shutdown()
+            self._watch.close()
             raise
         return self
 
@@ -172,6 +176,7 @@ class RayCluster:
                 ray.kill(actor)
             self._leave_room()
         ray.shutdown()
+        self._watch.close()
         if kind is None or issubclass(kind, Interrupted):
             remove_session(self._session)
 
@@ -463,18 +468,22 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
     not enough on a busy machine. While that lasts, `heed` is called, and may raise what ends it. Raises SpaceDistError
-    if Ray cannot be started or reached.
+    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that.
     """
+    where = f"at {address!r} (resources.address, or --address)"
     ours = address == "local"
     options: dict[str, Any] = (
         {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES} if ours else {}
     )
-    failures = 0
+    failures, most = 0, START_SECONDS if ours else JOIN_SECONDS
+    late = f"Ray cannot be started or reached {where}: it did not come up in {most:.0f} s"
     while True:
-        before = set(psutil.Process().children())
+        before, started = set(psutil.Process().children()), Started() if ours else None
         heed()
         try:
-            with _turn_to_start(heed) if ours else contextlib.nullcontext():
+            if not ours:
+                reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, heed)
+            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started):
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
                     job_config=_Driver(), **options,
@@ -485,7 +494,6 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
             failures += 1
             what = _first_line(error)
             if not ours or failures == _STARTS:
-                where = f"at {address!r} (resources.address, or --address)"
                 raise SpaceDistError(f"Ray cannot be started or reached {where}: {what}") from error
             log.warning("Ray did not start (%s); trying again", what)
             ray.shutdown()
@@ -494,7 +502,21 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
                     process.kill()
         else:
             found: dict[str, Any] = context.address_info  # type: ignore[attr-defined]
-            return found
+            return {**found, "started": started}
+
+
+@contextlib.contextmanager
+def attended(found: Mapping[str, Any], address: str, *, gone: bool) -> Iterator[None]:
+    """Watch the Ray that `join_ray` `found` at `address`; see `ray_watch.watched`. Afterwards none of ours is left."""
+    started: Started | None = found["started"]
+    where = "of our own" if started else f"at {address!r} (resources.address, or --address)"
+    places = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
+    if started is not None:
+        started.look()
+    with watched(places, where, started, gone=gone):
+        yield
+    if started is not None:
+        started.end()
 
 
 @contextlib.contextmanager

@@ -28,7 +28,7 @@ import ray
 import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
-from space_dist.distributed import join_ray, remove_session
+from space_dist.distributed import attended, join_ray, remove_session
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.importing import PYTHON
@@ -92,12 +92,13 @@ def _joined(
 
     # A run with rollout actors may have more processes than this machine has cores; they share them.
     context = join_ray(address, max(_cores(), (max_parallel or 1) * manifest.cpus_per_run), heed)
-    try:
-        yield context.get("webui_url") or ""
-    finally:
-        if ray_answers(context["gcs_address"]):
-            ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
-            remove_session(context["session_dir"] if address == "local" else None)
+    with attended(context, address, gone=False):  # whoever conducts says that itself
+        try:
+            yield context.get("webui_url") or ""
+        finally:
+            if ray_answers(context["gcs_address"]):
+                ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
+                remove_session(context["session_dir"] if address == "local" else None)
 
 
 def _cores() -> int:

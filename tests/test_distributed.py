@@ -146,10 +146,16 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
         raise Exception("The current node timed out during startup.\nThis could happen because")
 
     monkeypatch.setattr(ray, "init", never)
-    for address, starts in (("local", 5), ("127.0.0.1:1", 1)):  # somebody else's is not ours to start
+    monkeypatch.setattr("space_dist.ray_watch.REACH_SECONDS", 1.0)
+    up = "The current node timed out during startup."
+    for address, starts, what in (
+        ("local", 5, up),
+        ("auto", 1, up),
+        ("127.0.0.1:1", 0, "nobody listens there, for 1 s"),
+    ):
         run = config(1, f"resources.address={address}")
         where = rf"at '{address}' \(resources.address, or --address\)"
-        said = f"^Ray cannot be started or reached {where}: The current node timed out during startup.$"
+        said = f"^Ray cannot be started or reached {where}: {what}$"
         with pytest.raises(SpaceDistError, match=said), cluster_class(run, _setup(run)):
             pass
         assert begun == [address] * starts

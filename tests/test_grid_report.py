@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
-import itertools
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,10 @@ from space_dist.report.document import Document, Section, escaped, to_html, to_m
 from space_dist.report.grid import compare, heat_maps, pool, read_cells
 from space_dist.report.statistics import (
     Interval,
-    bootstrap_interval,
+    confidence_interval,
     estimates,
     interquartile_mean,
     intervals,
-    mean,
-    median,
     paired_ratio,
     probability_of_improvement,
     restricted,
@@ -41,6 +38,7 @@ from space_dist.report.statistics import (
     steps_to_threshold,
     stratified,
 )
+from space_dist.seeding import Purpose, generator
 from space_dist.standing import Attempts, Cause, Ended
 from tests.grids import SMALL, write_grid
 from tests.test_report import GROWTH, continue_run, start_run
@@ -87,43 +85,46 @@ def rows(path: Path) -> list[dict[str, str]]:
 # ---- statistics -----------------------------------------------------------------------------------------------------
 
 
-def bounds(outcomes: Sequence[float]) -> tuple[float, float]:
-    """The 95 % percentile bounds of all equally likely resamples."""
-    low, high = np.percentile(outcomes, [2.5, 97.5])
-    return float(low), float(high)
+def test_strata_spread_each_for_itself() -> None:
+    """0 1 and 10 14: the IQM of 0 1 10 14 is 5.5; that the strata lie apart is no spread.
 
-
-def picks(values: Sequence[float]) -> list[tuple[float, ...]]:
-    return list(itertools.product(values, repeat=len(values)))
-
-
-def test_strata_are_resampled_each_for_itself() -> None:
-    """Strata 0, 1 and 10, 14: every resample has two of each, so the mean lies in [5, 7.5]; unstratified in [0, 14]."""
+    Winsorised to 1 1 and 10 10, which spread nowhere; of all values, 1.1 / 4 sqrt(2 x 0.5 + 2 x 8), of whose degrees
+    of freedom Satterthwaite leaves 17^2 / (1 + 16^2).
+    """
     strata = [np.array([0.0, 1.0]), np.array([10.0, 14.0])]
-    assert stratified(strata, mean) == Interval(6.25, 5.0, 7.5)
+    half = stats.t.ppf(0.975, 17.0**2 / (1.0 + 16.0**2)) * 1.1 / 4.0 * math.sqrt(17.0)
+    found = stratified(strata)
+    assert (found.value, found.low, found.high) == pytest.approx((5.5, 5.5 - half, 5.5 + half))
     assert stratified([strata[0], np.array([3.0])]) == Interval(4.0 / 3.0)
+    alone = np.array([1.0, 2.0, 6.0, 8.0, 9.0])
+    assert stratified([alone]) == estimates([alone])[0].iqm
+    assert stratified([alone[:2]]) == Interval(1.5)
 
 
-def test_the_stratified_interval_is_that_of_all_resamples() -> None:
-    """The IQM of six pooled values: without the least and the greatest, over 27 x 27 resamples."""
-    one, two = (1.0, 2.0, 6.0), (3.0, 4.5, 9.0)
-    outcomes = [float(np.mean(sorted(a + b)[1:-1])) for a in picks(one) for b in picks(two)]
-    found = stratified([np.array(one), np.array(two)])
-    assert found.value == np.mean([2.0, 3.0, 4.5, 6.0])
-    np.testing.assert_allclose((found.low, found.high), bounds(outcomes), atol=0.15)
+def test_pooled_cells_cover_what_they_promise() -> None:
+    """Four cells of three and five seeds, a standard deviation apart: the percentile bootstrap covers 84 and 90 %."""
+    random = generator(0, Purpose.BOOTSTRAP, 2)
+    centres = np.arange(4.0)[:, None]
+    for n in (3, 5):
+        cells = random.standard_normal((400, 4, n)) + centres
+        found = [stratified(list(one)) for one in cells]
+        covered = np.mean([one.low is not None and one.high is not None and one.low <= 1.5 <= one.high
+                           for one in found])  # fmt: skip
+        assert 0.94 <= covered <= 0.995, n
 
 
-@pytest.mark.parametrize(
-    ("statistic", "by_hand"),
-    [(mean, np.mean), (median, np.median), (interquartile_mean, lambda values: np.mean(sorted(values)[1:-1]))],
-)
-def test_intervals_are_those_of_all_resamples(
-    statistic: Callable[..., Any], by_hand: Callable[[Sequence[float]], float]
-) -> None:
-    values = (0.0, 1.0, 5.0, 7.0, 20.0)
-    (found,) = intervals([np.array(values)], statistic)
-    assert found.value == by_hand(values)
-    np.testing.assert_allclose((found.low, found.high), bounds([float(by_hand(p)) for p in picks(values)]), atol=0.6)
+def test_p_better_and_the_ratio_cover_what_they_promise() -> None:
+    """Equal cells, so 1/2 and 1: the percentile bootstrap excludes the ratio's 1 in 17 % of the cases at five seeds."""
+    random = generator(0, Purpose.BOOTSTRAP, 3)
+    for n in (3, 5, 10):
+        ours, theirs = random.standard_normal((2, 400, n))
+        found = [probability_of_improvement(*pair) for pair in zip(ours, theirs, strict=True)]
+        assert np.mean([one.low is not None and one.high is not None and one.low <= 0.5 <= one.high
+                        for one in found]) >= 0.94, n  # fmt: skip
+        ratios = [paired_ratio(*np.exp(0.5 * np.stack(pair))) for pair in zip(ours, theirs, strict=True)]
+        covered = np.mean([one.low is not None and one.high is not None and one.low <= 1.0 <= one.high
+                           for one in ratios])  # fmt: skip
+        assert 0.92 <= covered <= 0.98, n
 
 
 def test_many_samples_at_once_are_like_each_alone() -> None:
@@ -131,23 +132,24 @@ def test_many_samples_at_once_are_like_each_alone() -> None:
     samples = [random.normal(size=n) for n in (4, 1, 7, 4, 0, 4)]
     for found, sample in zip(estimates(samples), samples, strict=True):
         assert found.n == len(sample)
-        if len(sample) > 1:
-            low, high = bootstrap_interval(sample)
+        if len(sample) > 2:
+            low, high = confidence_interval(sample)
             assert found.iqm == Interval(float(interquartile_mean(sample)), float(low), float(high))
-            assert found.mean == intervals([sample], mean)[0]
+            assert found.mean == intervals([sample], "mean")[0]
 
 
 def test_degenerate_samples_have_an_answer_and_no_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert intervals([np.full(5, 2.0)], median) == [Interval(2.0, 2.0, 2.0)]
-        assert intervals([np.array([2.0])], median) == [Interval(2.0)]
-        diverged, empty = intervals([np.array([1.0, np.nan, 3.0]), np.array([])], interquartile_mean)
+        assert intervals([np.full(5, 2.0)], "median") == [Interval(2.0)]
+        assert intervals([np.array([2.0])], "median") == [Interval(2.0)]
+        diverged, empty = intervals([np.array([1.0, np.nan, 3.0]), np.array([])], "iqm")
         assert math.isnan(diverged.value)
         assert math.isnan(empty.value)
         assert (diverged.low, empty.low) == (None, None)
         same = np.full(3, 2.0)
-        assert probability_of_improvement(same, same) == Interval(0.5, 0.5, 0.5)
+        tied = probability_of_improvement(same, same)
+        assert (tied.value, tied.low) == (0.5, pytest.approx(1.0 - (tied.high or 0.0)))
         assert probability_of_improvement(same, np.array([1.0])) == Interval(1.0)
         assert math.isnan(probability_of_improvement(same, np.array([])).value)
         assert math.isnan(probability_of_improvement(same, np.array([np.nan, 1.0])).value)
@@ -163,11 +165,6 @@ def test_probability_of_improvement_counts_all_pairs_and_half_the_ties() -> None
     found = probability_of_improvement(np.array(ours), np.array(theirs))
     assert found.value == pytest.approx(6 / 9)
     assert found.value == pytest.approx(stats.mannwhitneyu(ours, theirs).statistic / 9)
-    outcomes = [
-        np.mean([1.0 if x > y else 0.5 if x == y else 0.0 for x in a for y in b])
-        for a in picks(ours) for b in picks(theirs)
-    ]  # fmt: skip
-    assert (found.low, found.high) == pytest.approx(bounds(outcomes))
 
 
 def test_probability_of_improvement_of_unequal_samples() -> None:
@@ -175,8 +172,20 @@ def test_probability_of_improvement_of_unequal_samples() -> None:
     ours, theirs = random.normal(0.3, 1.0, 40), random.normal(0.0, 1.0, 25)
     found = probability_of_improvement(ours, theirs)
     assert found.value == pytest.approx(stats.mannwhitneyu(ours, theirs).statistic / 1000)
-    draws = [(random.choice(ours, 40)[:, None] > random.choice(theirs, 25)[None]).mean() for _ in range(4000)]
-    np.testing.assert_allclose((found.low, found.high), bounds(draws), atol=0.02)  # four standard errors of 2,000
+    low, high = found.low or 0.0, found.high or 0.0
+    for bound in (low, high):  # each explains the distance to the estimate by its own standard error
+        spread = 1.0 + 31.5 * ((1.0 - bound) / (2.0 - bound) + bound / (1.0 + bound))
+        error = math.sqrt(bound * (1.0 - bound) * spread / 1000.0)
+        assert abs(bound - found.value) == pytest.approx(stats.t.ppf(0.975, 63) * error, rel=1e-6)
+    other = probability_of_improvement(theirs, ours)
+    assert (other.low, other.high) == pytest.approx((1.0 - high, 1.0 - low))
+
+
+def test_three_seeds_that_beat_three_do_not_exclude_chance() -> None:
+    found = probability_of_improvement(np.array([4.0, 5.0, 6.0]), np.array([1.0, 2.0, 3.0]))
+    assert (found.value, found.high) == (1.0, 1.0)
+    assert found.low is not None
+    assert 0.3 < found.low < 0.5
 
 
 @pytest.mark.parametrize(
@@ -198,9 +207,12 @@ def test_a_threshold_is_reached_by_three_evaluations_in_a_row(returns: list[floa
 
 def test_censored_times_count_as_the_budget_and_seeds_go_in_pairs() -> None:
     np.testing.assert_equal(restricted(np.array([1.0, np.nan, 9.0]), 4.0), [1.0, 4.0, 4.0])
-    assert paired_ratio(np.array([2.0, 4.0]), np.array([4.0, 4.0])) == Interval(0.75, 0.5, 1.0)
-    # Every seed needs half of its twin's steps, so every resample does; in other pairs it would be 1/6 to 3/2.
-    assert paired_ratio(np.array([1.0, 3.0]), np.array([2.0, 6.0])) == Interval(0.5, 0.5, 0.5)
+    # 2 4 6 of a mean of 4 against 4 each: the log moves by -1/2, 0 and 1/2; 4.30265 times 1/2 over the root of 3.
+    found = paired_ratio(np.array([2.0, 4.0, 6.0]), np.full(3, 4.0))
+    assert (found.low, found.high) == pytest.approx((math.exp(-1.242061), math.exp(1.242061)), rel=1e-5)
+    # Every seed needs half of its twin's steps: nothing shows how much that varies.
+    assert paired_ratio(np.array([1.0, 3.0, 7.0]), np.array([2.0, 6.0, 14.0])) == Interval(0.5)
+    assert paired_ratio(np.zeros(3), np.full(3, 4.0)) == Interval(0.0)
 
 
 def test_the_noise_of_step_0_is_a_prediction_bound() -> None:
@@ -246,10 +258,13 @@ def test_every_number_says_how_many_seeds_it_rests_on(grid: Grid, written: Path)
     assert written == grid.folder / "report"
     text = (written / "report.md").read_text()
     assert "13 of 15 runs are finished (5 cells × 3 seeds); 1 failed, 1 waiting." in text
-    assert "| robin (baseline) | 3/3 | — | 3.000 [1.000, 6.000] (3/3) | 3.000 [1.000, 6.000] (3/3) |" in text
-    assert "| b | 2/3 | 1 failed: out of memory | 9.000 [9.000, 9.000] (2/3) |" in text
-    assert "| d | 2/3 | 1 waiting | 4.500 [4.000, 5.000] (2/3) |" in text
-    assert "1.00 [1.00, 1.00] (2/3 against 3/3)" in text
+    assert "| robin (baseline) | 3/3 | — | 3.000 [-3.572, 9.572] (3/3) | 3.000 [-3.572, 9.572] (3/3) |" in text
+    assert "| b | 2/3 | 1 failed: out of memory | 9.000 [—] (2/3) |" in text
+    assert "| d | 2/3 | 1 waiting | 4.500 [—] (2/3) |" in text
+    assert "1.00 [—] (2/3 against 3/3)" in text
+    few = "Intervals here rest on fewer than 10 seeds (robin: 3; a: 3; b: 2; c: 3; d: 2)"
+    assert few in text.partition("| cell |")[0]
+    assert few in (written / "report.html").read_text()
     checked = 0
     for head, body in re.findall(r"(?m)^(\| cell .*)\n\| ---.*\n((?:\|.*\n)+)", text):
         columns = head.split(" | ")
@@ -271,13 +286,9 @@ def test_cells_csv_has_the_numbers_in_full(written: Path) -> None:
     found = {row["configuration"]: row for row in rows(written / "cells.csv")}
     assert [*found] == ["robin", "a", "b", "c", "d"]
     a = found["a"]
-    assert [float(a[f"test_return_{name}"]) for name in ("iqm", "iqm_low", "iqm_high", "mean", "median")] == [
-        4,
-        2,
-        7,
-        4,
-        3,
-    ]
+    half = 4.302653 * math.sqrt(7.0 / 3.0)  # of 2, 3 and 7
+    found_in_a = [float(a[f"test_return_{name}"]) for name in ("iqm", "iqm_low", "iqm_high", "mean", "median")]
+    assert found_in_a == pytest.approx([4.0, 4.0 - half, 4.0 + half, 4.0, 3.0], rel=1e-6)
     # 2 beats 1 and ties 2; 3 beats 1 and 2; 7 beats all
     assert float(a["probability_of_improvement"]) == pytest.approx(6.5 / 9)
     assert (a["runs"], a["finished"], a["baseline_return_seeds"]) == ("3", "3", "3")
@@ -378,19 +389,16 @@ def test_steps_to_the_threshold_with_censoring_and_pairs(tmp_path: Path) -> None
     assert base.threshold == cell.threshold == 5.0
     assert base.reach is not None
     assert base.reach.times.tolist() == [1000, 2000, 2000]
-    assert base.reach.mean == Interval(pytest.approx(5000 / 3), 1000.0, 2000.0)
+    assert base.reach.mean == Interval(5000 / 3, pytest.approx(232.449, abs=1e-3), pytest.approx(3100.884, abs=1e-3))
     assert cell.reach is not None
     assert (cell.reach.censored, cell.reach.budget) == (1, 4000)
-    assert cell.reach.mean == Interval(2500.0, 1000.0, 4000.0)
-    assert cell.ratio == Interval(pytest.approx(5 / 3), 1.0, 2.0)
+    assert cell.reach.mean == Interval(2500.0)
+    assert cell.ratio == Interval(pytest.approx(5 / 3))
     assert cell.pairs == 2
     assert (empty.reach, empty.untestable) == (None, "no finished seed")
 
     text = build_grid_report(grid, tmp_path / "out").markdown
-    assert (
-        "| k=2 | 5.000 | 1/2 | 1/2 at 4,000 steps | 2,500 [1,000, 4,000] (2/3) | "
-        "1.67 [1.00, 2.00] (2/3 pairs) |" in text
-    )
+    assert "| k=2 | 5.000 | 1/2 | 1/2 at 4,000 steps | 2,500 [—] (2/3) | 1.67 [—] (2/3 pairs) |" in text
     assert compare(cells, cells[0], 100.0)[1].ratio is None  # reached by nobody: nothing is known, not a ratio of 1
 
 
@@ -561,4 +569,3 @@ def test_policies_that_share_a_curriculum_are_one_sample(tmp_path: Path) -> None
     made = plan(write_grid(tmp_path, set=settings, seeds=[0]), tmp_path / "runs")
     remarks = [line for line in build_grid_report(made.grid).remarks if "share one curriculum" in line]
     assert [line.partition(":")[0] for line in remarks] == ["kappa=1", "kappa=4"]
-    assert all("fewer than 5 says little" in line for line in remarks)

@@ -187,6 +187,8 @@ def test_updates_equal_stable_baselines3s_own_learning(kind: str, schedule: str)
     assert (model.replay_buffer.pos, model.replay_buffer.full) == (STEPS % 256, True)
     if kind == "dqn":
         assert learner.model.exploration_rate == model.exploration_rate
+        logged = ["exploration_rate" in update.metrics for update in updates]
+        assert logged == [False, False] + [True] * 28  # before learning starts no action hangs on it
     rates = {group["lr"] for one in learner._optimizers().values() for group in one.param_groups}
     assert rates == {0.0 if schedule == "linear" else 3e-3}
 

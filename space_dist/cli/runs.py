@@ -144,7 +144,7 @@ def report(
         typer.Option(help="Of a grid's YAML file: folder that holds the grids' folders, as of `space-dist grid`."),
     ] = None,
 ) -> None:
-    """Compare runs, or the cells of a grid: figures and tables with 95 % bootstrap intervals over seeds."""
+    """Compare runs, or the cells of a grid: figures and tables with 95 % intervals over seeds."""
     from space_dist.ledger import find_ledgers
     from space_dist.report import build_grid_report, build_report
 

@@ -147,6 +147,11 @@ class DQNLearner(OffPolicyLearner):
             ),
         )
 
+    def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
+        super()._learn(shards, steps=steps)
+        if steps <= self._settings.learning_starts:  # SB3 logs a rate that has not chosen an action yet
+            self.model.logger.name_to_value.pop("rollout/exploration_rate", None)
+
     def _mlp(self, version: int, statistics: Statistics) -> MlpPolicy:
         state = self.model.policy.state_dict()
         target = isinstance(self._settings, DQNConfig) and self._settings.scored_network == "target"

@@ -13,8 +13,8 @@ from space_dist.report.document import Document, Picture, Section, to_markdown
 from space_dist.report.figures import draw_comparison, draw_contexts, draw_curriculum, draw_learning_curve, png, save
 from space_dist.report.grid_report import GridReport, build_grid_report
 from space_dist.report.load import Configuration, Run, group, load_run, read_config
-from space_dist.report.statistics import RESAMPLES, Estimate, Interval, bootstrap_interval, estimate, interquartile_mean
-from space_dist.report.tables import Summary, cells, numbers, remarks, summarise, to_csv
+from space_dist.report.statistics import Estimate, Interval, confidence_interval, estimate, interquartile_mean
+from space_dist.report.tables import Summary, cells, few_seeds, numbers, remarks, summarise, to_csv
 
 __all__ = [
     "Configuration",
@@ -24,9 +24,9 @@ __all__ = [
     "Report",
     "Run",
     "Summary",
-    "bootstrap_interval",
     "build_grid_report",
     "build_report",
+    "confidence_interval",
     "draw_comparison",
     "draw_contexts",
     "draw_curriculum",
@@ -40,10 +40,10 @@ __all__ = [
     "summarise",
 ]
 
-_METHOD = f"""\
+_METHOD = """\
 Final numbers are those of each finished run's evaluation at its last step; returns are undiscounted means over the
-instances. IQM: interquartile mean over seeds (below four seeds the plain mean). [95 %]: percentile bootstrap over
-seeds, {RESAMPLES:,} resamples; with few seeds it is narrower than it should be, and a single seed has none. Curves show
+instances. IQM: interquartile mean over seeds (below four seeds the plain mean). [95 %]: an interval over
+seeds from Student's t and winsorised values; below three seeds there is none (docs/reports.md). Curves show
 finished runs (while there is none, unfinished ones); where seeds were evaluated at different steps, each counts with
 its last evaluation. Bands are the same intervals. Steps are real environment steps of training. "All instances
 reached": finished runs that were trained on all their instances at once, and from which step on (median over those)."""
@@ -75,11 +75,11 @@ def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
     configurations = group([load_run(ledger) for ledger in ledgers])
     summaries = summarise(configurations)
     table = [cells(summary) for summary in summaries]
+    few = few_seeds({summary.label: summary.test.n for summary in summaries})
     notes = [line for configuration in configurations for line in remarks(configuration)]
     picture = Picture("report.png", "Learning curves and set sizes", png(draw_comparison(configurations)))
-    document = Document(
-        "Report", [Section("", rows=table, items=notes, pictures=[picture]), Section("How to read this", [_METHOD])]
-    )
+    found = Section("", few, table, notes, [picture])
+    document = Document("Report", [found, Section("How to read this", [_METHOD])])
     markdown = to_markdown(document)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -88,4 +88,4 @@ def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
         atomic_write(out / "report.csv", to_csv([numbers(summary) for summary in summaries]).encode())
     except OSError as error:
         raise ConfigError(f"the report cannot be written to {out}: {error.strerror or error}") from None
-    return Report(table, notes, summaries, markdown, out / "report.png")
+    return Report(table, few + notes, summaries, markdown, out / "report.png")

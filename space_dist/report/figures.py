@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from space_dist.errors import LedgerError
 from space_dist.files import atomic_write
 from space_dist.report.load import Configuration, FloatArray, IntArray, Run
-from space_dist.report.statistics import bootstrap_interval, interquartile_mean
+from space_dist.report.statistics import confidence_interval, interquartile_mean
 
 # Okabe and Ito's palette: told apart with every common colour blindness; its yellow is left out, too pale for lines.
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -41,7 +41,7 @@ _DPI: Final = 150
 def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
     """Test returns, train returns and set sizes over real environment steps, one colour for each configuration.
 
-    Returns are IQMs over seeds with 95 % bootstrap bands, at the steps where any drawn seed was evaluated. Sizes are
+    Returns are IQMs over seeds with bands of 95 %, at the steps where any drawn seed was evaluated. Sizes are
     medians over seeds as far as all drawn seeds got, with a thin line for each seed.
     """
     figure = _figure(15.0, 4.6 + 0.25 * ((len(configurations) - 1) // 3))
@@ -78,7 +78,7 @@ class Panel:
 
 
 def draw_panels(panels: Sequence[Panel]) -> Figure:
-    """Test returns over real environment steps: IQMs over seeds with 95 % bootstrap bands, on axes of one scale."""
+    """Test returns over real environment steps: IQMs over seeds with bands of 95 %, on axes of one scale."""
     columns = min(_PANEL_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     longest = max(len(panel.configurations) for panel in panels)
@@ -334,7 +334,7 @@ def _draw_returns(axes: Axes, steps: IntArray, returns: FloatArray, label: str, 
     marker = "o" if len(steps) <= MAX_MARKED else None
     axes.plot(steps, centre, label=label, marker=marker, markersize=3, linewidth=1.8, **style)
     if len(returns) > 1:
-        low, high = bootstrap_interval(returns)
+        low, high = confidence_interval(returns)
         axes.fill_between(steps, low, high, color=style["color"], alpha=0.18, linewidth=0)
 
 

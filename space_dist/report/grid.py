@@ -27,7 +27,6 @@ from space_dist.report.statistics import (
     Interval,
     Reach,
     intervals,
-    mean,
     paired_ratio,
     probability_of_improvement,
     restricted,
@@ -41,7 +40,6 @@ from space_dist.standing import Cause, Standing, standings
 MAX_MAPS: Final = 24
 MAX_POOLED: Final = 200  # settings of which cells are pooled
 MAX_NAMED: Final = 12  # runs that a sentence names
-LEAST_POPULATIONS: Final = 5  # coupled ones, for an interval over a cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +150,11 @@ def compare(cells: Sequence[CellRuns], baseline: CellRuns, threshold: float | No
     references = {task: _reference(cells, baseline, task) for task in {cell.task for cell in cells}}
     found = [_compare(cell, references[cell.task], threshold) for cell in cells]
     tested = {number: reach for number, comparison in enumerate(found) if (reach := comparison.reach) is not None}
-    means = intervals([restricted(reach.times, reach.budget) for reach in tested.values()], mean)  # all cells at once
+    means = intervals([restricted(reach.times, reach.budget) for reach in tested.values()], "mean")  # all cells at once
     for (number, reach), interval in zip(tested.items(), means, strict=True):
-        found[number] = dataclasses.replace(found[number], reach=dataclasses.replace(reach, mean=interval))
+        found[number] = dataclasses.replace(
+            found[number], reach=dataclasses.replace(reach, mean=interval.within(0.0, reach.budget))
+        )
     return found
 
 
@@ -369,19 +369,13 @@ def fingerprint_remarks(cells: Sequence[CellRuns], manifest: Manifest) -> list[s
 
 
 def coupled_remarks(cells: Sequence[CellRuns]) -> list[str]:
-    """Of cells whose runs train several policies under one curriculum: what a sample is, and whether there are few."""
-    lines = []
-    for cell in cells:
-        curriculum = cell.cell.config.get("curriculum", {})
-        if curriculum.get("aggregate") == "population":
-            finished = len(cell.configuration.finished)
-            few = f" There are {finished}: an interval over fewer than {LEAST_POPULATIONS} says little."
-            lines.append(
-                f"{cell.label}: each run trains {curriculum['policies']} policies that share one curriculum, so they "
-                "depend on each other and count as one sample; returns are means over them, steps are those of all."
-                + (few if finished < LEAST_POPULATIONS else "")
-            )
-    return lines
+    """Of cells whose runs train several policies under one curriculum: what a sample is."""
+    return [
+        f"{cell.label}: each run trains {curriculum['policies']} policies that share one curriculum, so they depend on "
+        "each other and count as one sample; returns are means over them, steps are those of all."
+        for cell in cells
+        if (curriculum := cell.cell.config.get("curriculum", {})).get("aggregate") == "population"
+    ]
 
 
 def named(runs: Sequence[tuple[CellRuns, Run]]) -> str:

@@ -31,11 +31,12 @@ from space_dist.report.grid import (
     varying,
 )
 from space_dist.report.load import Configuration
-from space_dist.report.statistics import RESAMPLES, Interval
+from space_dist.report.statistics import FEWEST, Interval
 from space_dist.report.tables import (
     NONE,
     Value,
     caveats,
+    few_seeds,
     interval_numbers,
     interval_text,
     number_text,
@@ -56,18 +57,17 @@ Round brackets say how many of a cell's seeds a number rests on: (9/10) are nine
 not finished count in no number.
 
 Final returns are undiscounted means over the held-out (test) instances at each finished run's last step. IQM:
-interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are 95 % percentile
-bootstraps with {RESAMPLES:,} resamples (scipy.stats.bootstrap). What is resampled are the seeds of a cell; where cells
-are pooled, those of each cell among themselves (stratified). With few seeds they are narrower than they should be; a
-single seed has none. A cell with a final return that is no number has none either.
+interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are to cover 95 %: from
+Student's t and winsorised values, over the seeds of a cell; where cells are pooled, from the spread within each cell
+(stratified). Below {FEWEST} seeds, where seeds do not differ, and where a final return is no number, there is none.
 
 P(better) is the probability that a seed of the cell ends above a seed of the baseline, over all pairs of seeds, a tie
-counting one half; the seeds of both are resampled, each for itself.
+counting one half; its interval is that of Newcombe (2006), method 5, with Student's t.
 
 A threshold is reached at the first of three consecutive evaluations of the test return at or above it. Seeds that do
 not reach it within their budget are censored: they count as the budget in the restricted mean, which is a lower bound
 of the mean where seeds are censored. The ratio is the cell's restricted mean over the baseline's (0.5: in half of the
-steps), both up to the smaller budget; its seeds are resampled in pairs, and the threshold is held fixed. Untestable:
+steps), both up to the smaller budget; its interval is of pairs of seeds, and the threshold is held fixed. Untestable:
 the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound (mean + t s sqrt(1 + 1/n)) of
 one more untrained seed.
 
@@ -185,7 +185,7 @@ def _summary(
         f"Baseline: {baseline.label}{counterparts}. Threshold of the test return: "
         + (f"{number_text(level)} ({source})." if not math.isnan(level) else "none, for the baseline has no final IQM.")
     )
-    return sentences
+    return sentences + few_seeds({cell.label: cell.summary.test.n for cell in cells})
 
 
 def _remarks(manifest: Manifest, cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[str]:

@@ -7,13 +7,15 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from space_dist.report.load import SPLITS, Configuration, FloatArray, Run, Split, fingerprint_differences, standing
-from space_dist.report.statistics import Estimate, Interval, estimates, intervals, mean
+from space_dist.report.statistics import ENOUGH, FEWEST, Estimate, Interval, estimates, intervals
 
 NONE = "—"
+MAX_NAMED: Final = 6  # labels that a sentence names
 Value = str | int | float | None
 
 
@@ -45,7 +47,7 @@ def summarise(configurations: Sequence[Configuration]) -> list[Summary]:
     finished = [configuration.finished for configuration in configurations]
     test = estimates([finals(runs, "test", "return") for runs in finished])
     train = estimates([finals(runs, "train", "return") for runs in finished])
-    success = intervals([finals(runs, "test", "success") for runs in finished], mean)
+    success = intervals([finals(runs, "test", "success") for runs in finished], "mean")
     return [
         _summary(*parts) for parts in zip(configurations, test, train, (found.value for found in success), strict=True)
     ]
@@ -84,6 +86,21 @@ def remarks(configuration: Configuration) -> list[str]:
     if moved := [run for run in configuration.runs if run.status.fingerprint_changed]:
         lines.append(f"{label}: resumed with another arithmetic or other library versions: {_seeds(moved)}.")
     return lines
+
+
+def few_seeds(counts: Mapping[str, int]) -> list[str]:
+    """What is to be known before intervals over a few seeds are read; `counts`: how many seeds each label has."""
+    few = {label: count for label, count in counts.items() if 0 < count < ENOUGH}
+    if not few:
+        return []
+    named = [f"{label}: {count}" for label, count in list(few.items())[:MAX_NAMED]]
+    more = f"; and {len(few) - MAX_NAMED:,} more" if len(few) > MAX_NAMED else ""
+    without = f" Below {FEWEST} seeds there is none." if min(few.values()) < FEWEST else ""
+    return [
+        f"Intervals here rest on fewer than {ENOUGH} seeds ({'; '.join(named)}{more}): they are wide, and cover their "
+        "95 % only if the seeds are much alike. Where some seeds fail, or all end at the same limit, an interval "
+        f"over three seeds covers 80 to 85 %, one over five 92 %.{without}"
+    ]
 
 
 def caveats(configuration: Configuration) -> list[str]:

@@ -1,0 +1,123 @@
+"""A Ray that hangs, dies or is not there: told within a bound, nothing left behind, nothing lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from space_dist import ray_watch
+from space_dist.errors import SpaceDistError
+from space_dist.ray_watch import Started, asked, parts, reach
+from tests.patience import PATIENCE
+
+ROOT = Path(__file__).resolve().parents[2]
+IMPATIENT = (
+    "from space_dist import ray_watch as watch; watch.SILENT_SECONDS = 8.0; watch._ASK_SECONDS = 2.0; "
+    "from space_dist.cli import main; main()"
+)
+RUN = ["train", str(ROOT / "configs/pointmass_space.yaml"), "--workers", "1"]
+SMALL = ["learner.n_steps=512", "rollout.slots=1", "evaluation.every_steps=1000000", "tracking.uri=null"]
+
+
+@pytest.fixture
+def mute() -> Iterator[str]:
+    """An address whose connections the kernel takes, and nobody answers: as of a stopped process."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+
+
+def nobodys() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_what_hangs_is_told_from_what_is_gone(mute: str) -> None:
+    assert asked(mute, 0.2) == "silent"
+    assert asked(nobodys(), 0.2) == "gone"
+
+
+def test_an_address_that_nobody_answers_at_is_told(mute: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_watch, "REACH_SECONDS", 1.0)
+    heeded: list[int] = []
+    for address, said in ((nobodys(), "nobody listens there"), (mute, "what listens there does not answer")):
+        with pytest.raises(SpaceDistError, match=f"^{said}, for 1 s$"):
+            reach(address, lambda: heeded.append(1))
+        with pytest.raises(SpaceDistError, match=said):
+            reach(f"ray://{address}", lambda: None)
+    assert heeded
+    reach("auto", lambda: None)  # Ray's to find
+
+
+def test_only_what_we_started_is_ended() -> None:
+    before = subprocess.Popen(["/bin/sleep", "600"])
+    try:
+        started = Started()
+        other = subprocess.Popen(["/bin/sleep", "600"])  # ours, and no part of Ray
+        rays = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)", "/ray/core/raylet"])
+        time.sleep(0.2)
+        started.look()
+        started.end(0.0)
+        assert rays.wait(PATIENCE) == -signal.SIGKILL
+        assert (before.poll(), other.poll()) == (None, None)
+    finally:
+        for process in (before, other, rays):
+            process.kill()
+            process.wait()
+
+
+def test_the_parts_are_the_control_store_and_this_nodes_raylet() -> None:
+    nodes = [{"NodeID": name, "NodeManagerAddress": "10.0.0.1", "NodeManagerPort": port} for name, port in
+             (("a", 1), ("b", 2))]  # fmt: skip
+    assert parts(nodes, "b", "10.0.0.9:3") == {"the control store (GCS)": "10.0.0.9:3", "the raylet": "10.0.0.1:2"}
+
+
+@pytest.mark.ray
+@pytest.mark.parametrize(
+    ("victim", "number", "said"),
+    [
+        ("raylet", signal.SIGSTOP, "the raylet of the Ray of our own has not answered anything for"),
+        ("gcs_server", signal.SIGSTOP, "the control store (GCS) of the Ray of our own has not answered anything for"),
+        ("gcs_server", signal.SIGKILL, "the control store (GCS) of the Ray of our own has died"),
+    ],
+    ids=["a stopped raylet", "a stopped GCS", "a killed GCS"],
+)
+def test_a_ray_that_hangs_or_dies_ends_a_run_with_75(
+    victim: str, number: signal.Signals, said: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    settings = [word for setting in SMALL for word in ("--set", setting)]
+    with (tmp_path / "said").open("wb") as output:
+        run = subprocess.Popen(
+            [sys.executable, "-c", IMPATIENT, *RUN, "--out", str(out), *settings], cwd=ROOT,
+            stdout=output, stderr=output, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    below: list[psutil.Process] = []
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not (out / "metrics.jsonl").exists() and run.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.2)
+        below = psutil.Process(run.pid).children(recursive=True)
+        (hit,) = [process for process in below if process.name() == victim]
+        hit.send_signal(number)
+        assert run.wait(PATIENCE) == 75
+        assert said in (out / "log.txt").read_text()
+        assert said in (tmp_path / "said").read_text()
+        assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
+        assert json.loads((out / "status.json").read_text())
+    finally:
+        for process in [*below, run]:
+            try:
+                process.kill()
+            except (psutil.Error, ProcessLookupError):
+                continue
+        run.wait()
