@@ -38,7 +38,8 @@ from threadpoolctl import threadpool_limits
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
-from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
+from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
+from space_dist.walk import Walk
 
 _OBJECT_STORE_BYTES = 256 << 20
 _STARTS = 5  # of a Ray of our own
@@ -178,7 +179,8 @@ class RayCluster:
         """See `cluster.Cluster`."""
         asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
         shards = range(self._setup.shards)
-        return [self._ask(shard, "collect", policy, selection, walk, shard=shard, **asked)[0] for shard in shards]
+        return [self._ask(shard, "collect", policy, selection, walk.of(shard), shard=shard, **asked)[0]
+                for shard in shards]  # fmt: skip
 
     def start_values(self, policy: Handle) -> list[Handle]:
         """See `cluster.Cluster`."""
