@@ -23,8 +23,9 @@ from space_dist.learner import CoupledLearner
 from space_dist.ledger import Ledger
 from space_dist.policy import members_of
 from space_dist.population import advance, member
-from space_dist.rollout import Walk, Worker
+from space_dist.rollout import Worker
 from space_dist.training import learner_of, make_setup, memory_of
+from space_dist.walk import Walk
 from tests.grids import ROOT
 from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results
 from tests.tiny_env import Line
