@@ -110,7 +110,8 @@ class GrowingConfig(_Curriculum):
     """Whose values decide. own: the policy's. population: the mean over `policies` policies, which the run trains side
     by side (engine: population) and which share the selection: one run, and one sample. Source: ours."""
     policies: int = Field(default=4, ge=2, le=64)
-    """With aggregate: population, how many. Each collects learner.n_steps steps an update; all count in the budget."""
+    """With aggregate: population, how many. Each collects learner.n_steps steps an update, and passes over the whole
+    selection; all count in the budget."""
 
     @model_validator(mode="after")
     def _growth_is_possible(self) -> Self:

@@ -199,9 +199,9 @@ def segments_named(folder: Path) -> list[set[str]]:
 def test_only_pieces_that_a_checkpoint_names_are_kept(references: Any) -> None:
     _, folder, _ = references["dqn"]
     named = segments_named(folder)
-    # 150 transitions are those of the last three rounds, a part of the first of them; each checkpoint's own.
-    assert named[-1] == {f"{first:012d}-{first + 64:012d}.npz" for first in (128, 192, 256)}
-    assert named[0] == {f"{first:012d}-{first + 64:012d}.npz" for first in (192, 256, 320)}
+    # 150 transitions are those of the last four rounds, a part of the first of them; each checkpoint's own.
+    assert named[-1] == {f"{first:012d}-{first + 40:012d}.npz" for first in (40, 80, 120, 160)}
+    assert named[0] == {f"{first:012d}-{first + 40:012d}.npz" for first in (80, 120, 160, 200)}
     assert {file.name for file in Ledger(folder).replay.iterdir()} == set.union(*named), "a checkpoint lacks a piece"
     assert not Ledger(references["ppo"][1]).replay.exists()
 

@@ -23,7 +23,7 @@ from space_dist.learner import CoupledLearner
 from space_dist.ledger import Ledger
 from space_dist.policy import members_of
 from space_dist.population import advance, member
-from space_dist.rollout import Worker
+from space_dist.rollout import Shard, Worker
 from space_dist.training import learner_of, make_setup, memory_of
 from space_dist.walk import Walk
 from tests.grids import ROOT
@@ -249,6 +249,45 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
         assert made.gradient_steps == update.gradient_steps
     ours, theirs = learner.scored(), alone.scored()
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_each_of_them_meets_the_whole_selection_in_every_iteration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole passes of each policy, whatever the order, which is another one in every iteration."""
+    met: dict[tuple[int, int], set[int]] = {}  # by selection and policy: targets
+    learn = CoupledLearner.parts
+
+    def noted(self: CoupledLearner, shards: Sequence[Shard]) -> list[list[Shard]]:
+        for number, mine in enumerate(parts := learn(self, shards)):
+            for shard in mine:
+                seen = shard.observations[..., -1]  # type: ignore[call-overload]
+                met.setdefault((shard.selection_version, number), set()).update(np.round(seen, 3).ravel().tolist())
+        return parts
+
+    monkeypatch.setattr(CoupledLearner, "parts", noted)
+    curriculum = {
+        "kind": "random_growth",
+        "growth": "add",
+        "kappa": 4,
+        "eta": 1e9,
+        "aggregate": "population",
+        "policies": 4,
+    }
+    config = coupled(
+        tmp_path,
+        curriculum=curriculum,
+        budget={"steps": 4 * 12 * N_STEPS},
+        rollout={"shards": 2, "slots": 1, "passes": 2.0},
+    )
+    write_set(tmp_path / "train.csv", np.linspace(-0.9, 0.9, 12))
+    alone(config, tmp_path / "run")
+    rows = [row for row in Ledger(tmp_path / "run").rows() if row["kind"] == "iteration" and row["complete"]]
+    for version, row in enumerate(rows):
+        trained = row["curriculum"]["trained_size"]
+        assert row["round"] - (rows[version - 1]["round"] if version else 0) == max(1, -(-2 * trained * 8 // N_STEPS))
+        assert all(len(met[version, policy]) >= trained for policy in range(4)), (version, met)
+    assert rows[-1]["curriculum"]["trained_size"] == 12
 
 
 def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:
