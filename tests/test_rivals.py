@@ -296,6 +296,14 @@ def test_what_was_never_trained_on_comes_first() -> None:
     assert state.last[trained].tolist() == [1, 0, 0]
 
 
+def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:
+    plr = LevelReplay(instances(5), seed=0, draws=Draws(40, 4), temperature=0.1, staleness_share=0.1)
+    state, selection = plr.start()
+    after, again, numbers = plr.step(state, feedback(0, np.zeros(0, dtype=np.int64), n=5, advantages=0.0))
+    assert (after.version, numbers["seen"], numbers["mean_score"]) == (1, 0, None)
+    assert set(again.ids) == set(selection.ids) == set(range(10, 15))
+
+
 def test_mean_advantages_of_episodes_by_hand() -> None:
     def shard(slots: list[int], times: list[int], lengths: list[int], starts: list[bool]) -> Any:
         whole = (np.array(column, dtype=np.int64) for column in (slots, times, lengths))

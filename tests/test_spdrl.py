@@ -247,6 +247,16 @@ def test_the_distribution_moves_once_the_warm_up_is_over_and_alpha_follows_perfo
     assert told[4]["target_std_b"] == pytest.approx(0.1)
 
 
+def test_an_iteration_in_which_no_episode_ended_moves_nothing() -> None:
+    one = curriculum()
+    state, selection = one.start()
+    for _ in range(3):
+        state, _, numbers = one.step(state, feedback(state, selection.contexts[:0]))
+        assert (numbers["moved"], numbers["mean_discounted_return"], numbers["alpha"]) == (False, None, None)
+    assert np.array_equal(state.mean, one.start()[0].mean)
+    assert (state.version, state.updates) == (3, 0)
+
+
 def test_the_limit_holds_only_while_the_target_is_far() -> None:
     least = np.array([0.45, 1.9])
     for until, held in ((0.0, True), (1e9, False)):
