@@ -252,6 +252,7 @@ class Worker:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
+        self._first = [setup.make_env(setup.slots)]  # whatever is wrong with it shall be known before any work is asked
         self._stages: dict[int, Stage] = {}  # by shard; what is beyond LIVE shares one
         self._evaluating: dict[int, BatchedEnv] = {}
         self._scoring: BatchedEnv | None = None
@@ -262,7 +263,7 @@ class Worker:
         setup, shard = self._setup, asked["shard"]
         seat = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
         if seat not in self._stages:
-            self._stages[seat] = Stage(setup.make_env(setup.slots))
+            self._stages[seat] = Stage(self._first.pop() if self._first else setup.make_env(setup.slots))
         return collect(
             self._stages[seat], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
