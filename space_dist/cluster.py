@@ -17,7 +17,8 @@ from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, 
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Walk, Worker, joined
+from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Worker, joined
+from space_dist.walk import Walk
 
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 

@@ -124,7 +124,8 @@ class GrowingConfig(_Curriculum):
     """Whose values decide. own: the policy's. population: the mean over `policies` policies, which the run trains side
     by side (engine: population) and which share the selection: one run, and one sample. Source: ours."""
     policies: int = Field(default=4, ge=2, le=64)
-    """With aggregate: population, how many. Each collects learner.n_steps steps an update; all count in the budget."""
+    """With aggregate: population, how many. Each collects learner.n_steps steps an update, and passes over the whole
+    selection; all count in the budget."""
 
     @model_validator(mode="after")
     def _growth_is_possible(self) -> Self:
@@ -536,7 +537,7 @@ class A2CConfig(_OnPolicy):
 class _OffPolicy(_Learner):
     n_steps: int = Field(default=512, ge=1)
     """Environment transitions per round, over all shards and slots, collected with the policy of the round before:
-    SB3's train_freq. Every slot starts from a fresh reset, so a slot must be as long as the horizon."""
+    SB3's train_freq."""
     n_episodes: int | None = Field(default=None, ge=1)
     """End a round with this many episodes instead; rollout.shards and rollout.slots must be 1. null: by n_steps."""
     gamma: float = Field(default=0.99, ge=0.0, le=1.0)
@@ -636,8 +637,8 @@ class RolloutConfig(Section):
     shards: int = Field(default=4, ge=1, le=4096)
     """Independent parts of a round; at most this many workers can share it."""
     slots: int = Field(default=4, ge=1, le=65536)
-    """Environments stepped together in a shard. shards * slots must divide learner.n_steps, and
-    n_steps / (shards * slots) must be at least the environment's horizon."""
+    """Environments stepped together in a shard. shards * slots must divide learner.n_steps; episodes go on from round
+    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon."""
     passes: float = Field(default=1.0, gt=0.0)
     """Length of an iteration: as many updates as cover this many passes over the selected instances at full horizon."""
     start_states: int = Field(default=1, ge=1, le=1000)

@@ -41,7 +41,8 @@ from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
 from space_dist.ray_watch import JOIN_SECONDS, START_SECONDS, Started, bounded, parts, reach, watched
-from space_dist.rollout import FloatArray, IntArray, Setup, Split, Walk, Worker
+from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
+from space_dist.walk import Walk
 
 _OBJECT_STORE_BYTES = 256 << 20
 _STARTS = 5  # of a Ray of our own
@@ -190,7 +191,8 @@ class RayCluster:
         """See `cluster.Cluster`."""
         asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
         shards = range(self._setup.shards)
-        return [self._ask(shard, "collect", policy, selection, walk, shard=shard, **asked)[0] for shard in shards]
+        return [self._ask(shard, "collect", policy, selection, walk.of(shard), shard=shard, **asked)[0]
+                for shard in shards]  # fmt: skip
 
     def start_values(self, policy: Handle) -> list[Handle]:
         """See `cluster.Cluster`."""

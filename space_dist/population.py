@@ -26,18 +26,19 @@ from space_dist.errors import SpaceDistError, exits_refused
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, begun, speaking
 from space_dist.learner import CoupledLearner, PopulationLearner, learn_together
-from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Trial, Walk, collect, evaluate
+from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Stage, Trial, collect, evaluate
 from space_dist.training import Learn, Wait, Work
+from space_dist.walk import Walk
 
 _SLOTS = 1024  # environments stepped together, at most: what the cache holds of them. Decides no result
-_KEPT = 4  # batches of environments that are kept
+_KEPT = 4  # batches of environments that are kept, beside those in which episodes go on
 
 
 def member(config: RunConfig, folder: Path, *, stop: StopRequests) -> Work[Outcome]:
     """One run of a population, to its end or from where it stopped; raises as `launch` does."""
     with begun(config, folder, resume=True, stop=StopRequests(stop)) as course:
         if not course.outcome.already_done:
-            yield from course.training(_Promising(config, course.setup)).work()
+            yield from course.training(_Promising(config, course.setup, folder)).work()
     return course.finished()
 
 
@@ -125,12 +126,16 @@ def _parts_of(folder: Path, request: Learn) -> Iterator[_Part]:
         raise TypeError(f"{folder}: a member of a population needs engine: population")
 
 
+Seat = tuple[str, int]  # a member's folder and a shard
+
+
 @dataclass(eq=False)
 class _Promise:
     """A handle: shards or outcomes that a member waits for. value: once it is known; an exception where it failed."""
 
     setup: Setup
     work: Rollout | Trial
+    seat: Seat | None = None  # whose episodes a rollout goes on with
     value: Any = None
 
     @property
@@ -151,12 +156,17 @@ class _Promise:
 class _Promising(InProcess):
     """A member's cluster: what is large is promised, and computed with its like; the rest is done at once."""
 
+    def __init__(self, config: RunConfig, setup: Setup, folder: Path) -> None:
+        super().__init__(config, setup)
+        self._folder = str(folder)
+
     def collect(
         self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
     ) -> list[Handle]:
         """See `Cluster`."""
         asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
-        return [_Promise(self._setup, self._setup.rollout(policy, selection, walk, shard=shard, **asked))
+        return [_Promise(self._setup, self._setup.rollout(policy, selection, walk, shard=shard, **asked),
+                         seat=(self._folder, shard))
                 for shard in range(self._setup.shards)]  # fmt: skip
 
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
@@ -170,7 +180,8 @@ class _Workshop:
     """Computes what members were promised, in batches over all of them."""
 
     def __init__(self) -> None:
-        self._envs: dict[Hashable, BatchedEnv] = {}
+        self._spare: dict[Hashable, list[BatchedEnv]] = {}  # by batch and slots; the latest used is last
+        self._stages: dict[tuple[Seat, ...], tuple[Hashable, Stage]] = {}  # in which these seats' episodes go on
 
     def answers(self, waiting: Mapping[Path, Wait]) -> dict[Path, Any]:
         """The values that each member waits for; an exception for one whose work failed."""
@@ -184,15 +195,18 @@ class _Workshop:
 
     def close(self) -> None:
         """Free the environments."""
-        while self._envs:
-            self._forget(next(iter(self._envs)))
+        for seats in list(self._stages):
+            self._disband(seats)
+        while self._spare:
+            self._drop_oldest()
 
     def _keep(self, promises: Sequence[_Promise]) -> None:
         batches: dict[Hashable, list[_Promise]] = defaultdict(list)
         for promise in promises:
             batches[promise.batch].append(promise)
         for batch, promised in batches.items():
-            for some in _parts(promised):
+            # In the same order every round, whoever was answered first: else episodes would be played again.
+            for some in _parts(sorted(promised, key=lambda promise: promise.seat or ("", 0))):
                 try:
                     with exits_refused():
                         self._compute(batch, some)
@@ -200,13 +214,15 @@ class _Workshop:
                     self._compute_apart(batch, some)
 
     def _compute(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
-        env = self._env(batch, promised)
         setup, works = promised[0].setup, [promise.work for promise in promised]
-        rollouts = [work for work in works if isinstance(work, Rollout)]
-        values: Sequence[Any] = (
-            collect(env, rollouts, length=setup.slot_length) if rollouts
-            else evaluate(env, [work for work in works if isinstance(work, Trial)])
-        )  # fmt: skip
+        key = (batch, sum(promise.slots for promise in promised))
+        values: Sequence[Any]
+        if rollouts := [work for work in works if isinstance(work, Rollout)]:
+            values = collect(self._stage(key, promised), rollouts, length=setup.slot_length)
+        else:
+            env = self._env(key, promised)
+            values = evaluate(env, [work for work in works if isinstance(work, Trial)])
+            self._keep_spare(key, env)
         for promise, value in zip(promised, values, strict=True):
             promise.value = value
 
@@ -220,17 +236,38 @@ class _Workshop:
                 promise.value = error
         self.close()
 
-    def _env(self, batch: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:
-        slots = sum(promise.slots for promise in promised)
-        key = (batch, slots)
-        if key not in self._envs:
-            while len(self._envs) >= _KEPT:
-                self._forget(next(iter(self._envs)))
-            self._envs[key] = promised[0].setup.make_env(slots)
-        return self._envs[key]
+    def _stage(self, key: Hashable, promised: Sequence[_Promise]) -> Stage:
+        """Where these seats' episodes go on; their environments from other company are free."""
+        seats = tuple(promise.seat for promise in promised if promise.seat is not None)
+        if seats not in self._stages:
+            for others in [others for others in self._stages if not set(others).isdisjoint(seats)]:
+                self._disband(others)
+            self._stages[seats] = (key, Stage(self._env(key, promised)))
+        return self._stages[seats][1]
 
-    def _forget(self, key: Hashable) -> None:
-        env = self._envs.pop(key)
+    def _disband(self, seats: tuple[Seat, ...]) -> None:
+        key, stage = self._stages.pop(seats)
+        self._keep_spare(key, stage.env)
+
+    def _env(self, key: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:
+        """A spare one, or a new one."""
+        if key not in self._spare:
+            return promised[0].setup.make_env(sum(promise.slots for promise in promised))
+        env = self._spare[key].pop()
+        if not self._spare[key]:
+            del self._spare[key]
+        return env
+
+    def _keep_spare(self, key: Hashable, env: BatchedEnv) -> None:
+        self._spare[key] = [*self._spare.pop(key, []), env]
+        while sum(map(len, self._spare.values())) > _KEPT:
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        key = next(iter(self._spare))
+        env = self._spare[key].pop(0)
+        if not self._spare[key]:
+            del self._spare[key]
         if isinstance(env, Closable):
             with contextlib.suppress(Exception):
                 env.close()

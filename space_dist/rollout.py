@@ -1,5 +1,9 @@
 """Collecting episodes, evaluating policies and scoring instances: pure functions of (policy, selection, seed).
 
+A round is a fixed number of steps, and episodes go on across rounds: what a shard leaves unfinished is part of its
+answer, and of the question that the next round asks. Whoever still has these very episodes in its environment goes on
+at once; anybody else plays the recorded actions again, which the contract of environments makes exact.
+
 A rollout actor imports neither torch nor Stable-Baselines3, unless the policy it is sent does. The number of shards,
 the slots of a shard and the size of every chunk are fixed by the config: whoever computes a piece of work, and how
 often, it gives the same bits.
@@ -23,33 +27,36 @@ from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.policy import Noise, Policy, Several, Valuing, members_of, side_by_side
 from space_dist.seeding import Purpose, episode_seeds, generator
+from space_dist.walk import Unfinished, Walk
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Split = Literal["train", "test"]
 
 CHUNK = 65_536  # start observations scored by one call
+_SHARED = -1
 BLOCK = 2_048  # rows of one matrix product: what fits the cache. Both are part of every result
-TERMINATED, TRUNCATED, CUT = 0, 1, 2
+LIVE = 64  # shards whose episodes a worker keeps going between rounds. Decides no result
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """One entry per episode, in the order in which they started.
+    """The episodes that ended in a round, whole ones, in the order in which they ended: time, then slots.
 
-    ids: instance.  slots, starts, lengths: where in the shard, in steps.  returns, discounted_returns: sums of rewards.
+    ids: instance.  contexts: (m, d) in environment units.  slots, times: where in the shard, and at which of the
+    round's steps, each ended.  lengths: in steps, of which those before the round count.  returns, discounted_returns:
+    sums of all rewards.
     success: whether the goal was reached at the last step; NaN where the environment knows no success.
-    ends: TERMINATED, TRUNCATED (by the environment's horizon) or CUT (by the end of the round).
     """
 
     ids: IntArray
+    contexts: FloatArray
     slots: IntArray
-    starts: IntArray
+    times: IntArray
     lengths: IntArray
     returns: FloatArray
     discounted_returns: FloatArray
     success: FloatArray
-    ends: IntArray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -61,10 +68,12 @@ class Shard:
 
     observations (length, slots, ...), actions (length, slots, ...) as a buffer stores them, rewards (length, slots),
     terminated, truncated (length, slots).
-    last_observations: (slots, ...) behind the last step, from which cut episodes are bootstrapped.
+    starts: (slots,) whether a slot's first step began an episode, and did not go on with one.
+    last_observations: (slots, ...) behind the last step, from which episodes that go on are bootstrapped.
     truncated_observations: (k, ...) the last observation of each truncated episode, in the order of
         `np.argwhere(truncated)`.
     next_observations: (length, slots, ...) behind every step, if asked for: replay buffers need them.
+    begun: how many episodes were begun.  unfinished: what runs on.
     """
 
     shard: int
@@ -77,10 +86,13 @@ class Shard:
     rewards: FloatArray
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
+    starts: NDArray[np.bool_]
     last_observations: Observations
     truncated_observations: Observations
     next_observations: Observations | None
     episodes: Episodes
+    begun: int
+    unfinished: Unfinished
 
     @property
     def steps(self) -> int:
@@ -111,30 +123,8 @@ class Outcomes:
 
 
 @dataclass(frozen=True)
-class Walk:
-    """Where each shard goes on in the selection; void once the selection's order has changed.
-
-    positions: (shards,) of the next episode's instance in the selection's order.
-    """
-
-    order_version: int
-    positions: tuple[int, ...]
-
-    def position(self, selection: Selection, shard: int, n_shards: int) -> int:
-        """The place in `selection` of a shard's next episode: shards start spread over a new order."""
-        if selection.order_version == self.order_version:
-            return self.positions[shard] % len(selection.ids)
-        return shard * len(selection.ids) // n_shards
-
-    def places(self, selection: Selection, shard: int, n_shards: int, episodes: int) -> IntArray:
-        """`(episodes,)` the places in `selection` of a shard's next episodes."""
-        places: IntArray = (self.position(selection, shard, n_shards) + np.arange(episodes)) % len(selection.ids)
-        return places
-
-
-@dataclass(frozen=True)
 class Rollout:
-    """One shard to be collected: all from fresh resets, walking `selection` from `start`.
+    """One shard to be collected: going on with what is `unfinished`, then walking `selection` from `start`.
 
     steps: environment steps of the run before this shard's first, in the order of a replay buffer (time, then slots).
     """
@@ -147,6 +137,7 @@ class Rollout:
     round: int
     shard: int
     steps: int = 0
+    unfinished: Unfinished | None = None
 
 
 @dataclass(frozen=True)
@@ -205,12 +196,17 @@ class Setup:
         return max(1, CHUNK // self.start_states)
 
     @property
+    def walks(self) -> int:
+        """Shards that share an order: a member's. Every member meets the whole selection."""
+        return self.shards // self.members
+
+    @property
     def evaluation_parts(self) -> int:
         """Pieces into which the evaluation of one split, by every member, is cut."""
         return self.shards
 
     def _member(self, policy: Policy | Several, part: int) -> Policy:
-        return members_of(policy)[part // (self.shards // self.members)]
+        return members_of(policy)[part // self.walks]
 
     def rollout(
         self, policy: Policy | Several, selection: Selection, walk: Walk,
@@ -226,9 +222,9 @@ class Setup:
                 f"and got selection {selection.version} and policy {policy.version}"
             )
         return Rollout(
-            self._member(policy, shard), selection, start=walk.position(selection, shard, self.shards),
+            self._member(policy, shard), selection, start=walk.position(selection, shard, self.walks),
             gamma=self.gamma, seed=self.seed, round=round, shard=shard,
-            steps=steps + shard * self.slots * self.slot_length,
+            steps=steps + shard * self.slots * self.slot_length, unfinished=walk.running(shard),
         )  # fmt: skip
 
     def trial(self, policy: Policy | Several, split: Split, part: int, *, stochastic: bool = False) -> Trial:
@@ -256,16 +252,20 @@ class Worker:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self._collecting = setup.make_env(setup.slots)
+        self._first = [setup.make_env(setup.slots)]  # whatever is wrong with it shall be known before any work is asked
+        self._stages: dict[int, Stage] = {}  # by shard; what is beyond LIVE shares one
         self._evaluating: dict[int, BatchedEnv] = {}
         self._scoring: BatchedEnv | None = None
         self._starts: dict[int, Observations] = {}
 
     def collect(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> Shard:
         """One shard of one round; `asked`: see `Setup.rollout`."""
-        setup = self._setup
+        setup, shard = self._setup, asked["shard"]
+        seat = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
+        if seat not in self._stages:
+            self._stages[seat] = Stage(self._first.pop() if self._first else setup.make_env(setup.slots))
         return collect(
-            self._collecting, [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
+            self._stages[seat], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
         )[0]  # fmt: skip
 
@@ -314,17 +314,41 @@ class Worker:
         return evaluate(self._evaluating[len(trial)], [trial])[0]
 
 
+class Stage:
+    """An environment and the episodes that run in it between rounds."""
+
+    def __init__(self, env: BatchedEnv) -> None:
+        self.env = env
+        self._running: list[Unfinished] = []  # shard by shard; empty where nobody knows
+        self._current: Observations = {}
+
+    def leave(self, running: list[Unfinished], current: Observations) -> None:
+        """Note what runs on, and the observations (n_slots, ...) that it has come to."""
+        self._running, self._current = running, current
+
+    def resume(self, wanted: Sequence[Unfinished | None]) -> Observations | None:
+        """The observations (n_slots, ...) from which to go on, if exactly what is wanted runs here.
+
+        Until `leave`, nobody knows what does: whoever goes on may fail halfway.
+        """
+        running, self._running = self._running, []
+        live = len(running) == len(wanted) and all(one.same(two) for one, two in zip(running, wanted, strict=True))
+        return self._current if live else None
+
+
 def collect(
-    env: BatchedEnv, rollouts: Sequence[Rollout], *, length: int, episodes: int | None = None,
+    stage: Stage, rollouts: Sequence[Rollout], *, length: int, episodes: int | None = None,
     keep_next_observations: bool = False,
 ) -> list[Shard]:  # fmt: skip
     """Collect `length * slots` transitions for each rollout, side by side: an equal share of the slots is each one's.
 
-    A shard has the same bits whoever is collected beside it. Slots that end their episode at the same step take the
-    next instances in slot order. The last episode of a slot is cut where the round ends. With `episodes`, which takes
-    a single rollout and slot, the round ends when that many have.
+    A shard has the same bits whoever is collected beside it, and whether its episodes still run on the stage or are
+    played again. Slots that end their episode at the same step take the next instances in slot order. What runs at the
+    end is unfinished. With `episodes`, which takes a single rollout and slot, the round ends when that many have.
+
+    Raises SpaceDistError if an episode goes on beyond the environment's horizon, or goes another way when played again.
     """
-    slots = env.n_slots // len(rollouts)
+    env, slots = stage.env, stage.env.n_slots // len(rollouts)
     walk = _Walking(rollouts, slots, length)
     acting = side_by_side([rollout.policy for rollout in rollouts], slots)
     noise = Noise.joined([
@@ -339,49 +363,113 @@ def collect(
     terminated = np.zeros((length, env.n_slots), dtype=np.bool_)
     truncated = np.zeros((length, env.n_slots), dtype=np.bool_)
     actions: list[NDArray[np.generic]] = []
+    executed: list[NDArray[np.generic]] = []
     last: list[Observations] = []
-    table = _EpisodeTable(np.repeat([rollout.gamma for rollout in rollouts], slots))
+    table = _EpisodeTable(rollouts, slots)
 
-    current = allocate(env.observation_space, env.n_slots)
-    ended = np.arange(env.n_slots)
+    live = stage.resume([rollout.unfinished for rollout in rollouts])
+    current = live if live is not None else _replayed(env, table)
+    ended = starting = np.flatnonzero(~table.runs)
     for time in range(length):
         if len(ended):
-            if episodes is not None and len(table) == episodes:
+            if episodes is not None and table.ended == episodes:
                 length = time
                 break
             ids, contexts, seeds = walk.next(ended)
             put(current, ended, env.reset(ended, contexts, seeds))
-            table.begin(ended, ids, time)
+            table.begin(ended, ids, contexts, seeds, time)
         stored = acting.head.sampled(acting.outputs(current), noise, time, first_steps + time * slots)
-        step = env.step(acting.head.executed(stored))
+        given = acting.head.executed(stored)
+        step = env.step(given)
         put(observations, time, current)
         rewards[time] = step.rewards
         terminated[time], truncated[time] = step.terminated, step.truncated & ~step.terminated
         actions.append(stored)
-        table.add(step.rewards, step.success)
+        executed.append(given)
+        table.add(step.rewards)
         last.append(take(step.observations, truncated[time]))
         if following is not None:
             put(following, time, step.observations)
         ended = np.flatnonzero(terminated[time] | truncated[time])
-        table.end(ended, np.where(terminated[time], TERMINATED, TRUNCATED)[ended])
+        table.end(ended, time, step.success)
         put(current, slice(None), step.observations)
-    table.end(table.running(), np.full(len(table.running()), CUT))
+    if (table.lengths(length)[table.runs] >= env.horizon).any():
+        raise _endless(env)
     stored, lasts = np.stack(actions), concatenate(last)
     owners = np.nonzero(truncated[:length])[1] // slots  # of each last observation
+    told, unfinished = table.episodes(len(rollouts)), table.unfinished(len(rollouts), np.stack(executed))
+    starts = np.zeros(env.n_slots, dtype=np.bool_)
+    starts[starting] = True
     shards = []
-    for index, (rollout, told) in enumerate(zip(rollouts, table.episodes(len(rollouts)), strict=True)):
+    for index, rollout in enumerate(rollouts):
         mine = (slice(length), slice(index * slots, (index + 1) * slots))
         shards.append(
             Shard(
                 shard=rollout.shard, round=rollout.round, policy_version=rollout.policy.version,
                 selection_version=rollout.selection.version, order_version=rollout.selection.order_version,
                 observations=take(observations, mine), actions=stored[mine].copy(), rewards=rewards[mine].copy(),
-                terminated=terminated[mine].copy(), truncated=truncated[mine].copy(),
+                terminated=terminated[mine].copy(), truncated=truncated[mine].copy(), starts=starts[mine[1]].copy(),
                 last_observations=take(current, mine[1]), truncated_observations=take(lasts, owners == index),
-                next_observations=None if following is None else take(following, mine), episodes=told,
+                next_observations=None if following is None else take(following, mine), episodes=told[index],
+                begun=int(walk.begun[index]), unfinished=unfinished[index],
             )
         )  # fmt: skip
+    stage.leave(unfinished, current)
     return shards
+
+
+def _replayed(env: BatchedEnv, table: _EpisodeTable) -> Observations:
+    """`(n_slots, ...)` the observations that all running episodes have come to, played again; anything in other slots.
+
+    Episodes are begun one after another, such that all arrive at the same time. Until its own begins, a slot plays the
+    longest: every slot must be steppable. Raises SpaceDistError if an episode ends, or earns, other than it did.
+    """
+    current = allocate(env.observation_space, env.n_slots)
+    lengths = np.where(table.runs, table.lengths(0), 0)
+    leader, steps = int(lengths.argmax()), int(lengths.max())
+    if not steps:
+        return current
+    begins = steps - lengths
+    own = begins == 0
+    contexts = np.where(own[:, None], table.contexts, table.contexts[leader])
+    seeds = np.where(own, table.seeds, table.seeds[leader])
+    put(current, slice(None), env.reset(np.arange(env.n_slots), contexts, seeds))
+    returns = np.zeros(env.n_slots)
+    for time in range(steps):
+        late = np.flatnonzero(begins == time)
+        if time and len(late):
+            put(current, late, env.reset(late, table.contexts[late], table.seeds[late]))
+            own[late], returns[late] = True, 0.0
+        actions = table.actions[time].copy()
+        actions[~own] = actions[leader]
+        step = env.step(actions)
+        returns += step.rewards
+        put(current, slice(None), step.observations)
+        ended = np.flatnonzero(step.terminated | step.truncated)
+        if len(ended):
+            slot = ended[0] if own[ended[0]] else leader
+            raise _another_way(f"ended after {time + 1 - begins[slot]} steps, and had gone on for {lengths[slot]}")
+    differ = np.flatnonzero(table.runs & (returns != table.returns) & ~(np.isnan(returns) & np.isnan(table.returns)))
+    if len(differ):
+        slot = differ[0]
+        earned, before = float(returns[slot]), float(table.returns[slot])
+        raise _another_way(f"earned {earned!r} in {lengths[slot]} steps, and had earned {before!r}")
+    return current
+
+
+def _another_way(how: str) -> SpaceDistError:
+    return SpaceDistError(
+        "the environment breaks its word: an episode that was played again with the same context, seed and actions "
+        f"{how}. Everything random in an episode must come from the seed of its reset, and nothing may be left of "
+        "earlier episodes; `space-dist env check` looks for the cause"
+    )
+
+
+def _endless(env: BatchedEnv) -> SpaceDistError:
+    return SpaceDistError(
+        f"the environment does not end its episodes: after its horizon of {env.horizon} steps, neither terminated nor "
+        "truncated was set"
+    )
 
 
 class _Walking:
@@ -389,7 +477,7 @@ class _Walking:
 
     def __init__(self, rollouts: Sequence[Rollout], slots: int, length: int) -> None:
         self._slots = slots
-        self._begun = np.zeros(len(rollouts), dtype=np.int64)
+        self.begun = np.zeros(len(rollouts), dtype=np.int64)  # episodes
         self._starts = np.array([rollout.start for rollout in rollouts])
         self._sizes = np.array([len(rollout.selection.ids) for rollout in rollouts])
         self._firsts = np.cumsum(self._sizes) - self._sizes  # of each rollout's instances among all
@@ -402,8 +490,8 @@ class _Walking:
     def next(self, slots: IntArray) -> tuple[IntArray, FloatArray, NDArray[np.uint64]]:
         """(k,) ids, (k, d) contexts and (k,) seeds of the episodes that begin in `slots` (k,), which ascend."""
         owners = slots // self._slots
-        numbers = self._begun[owners] + np.arange(len(slots)) - np.searchsorted(owners, owners)
-        self._begun += np.bincount(owners, minlength=len(self._begun))
+        numbers = self.begun[owners] + np.arange(len(slots)) - np.searchsorted(owners, owners)
+        self.begun += np.bincount(owners, minlength=len(self.begun))
         places = self._firsts[owners] + (self._starts[owners] + numbers) % self._sizes[owners]
         return self._ids[places], self._contexts[places], self._seeds[owners, numbers]
 
@@ -436,10 +524,7 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
         backward = np.where(alive, gamma * backward + step.rewards, backward)
         time += 1
         if time == env.horizon and (alive & ~(step.terminated | step.truncated)).any():
-            raise SpaceDistError(
-                f"the environment does not end its episodes: after its horizon of {env.horizon} steps, neither "
-                "terminated nor truncated was set"
-            )
+            raise _endless(env)
         returns += np.where(alive, step.rewards, 0.0)
         discounted += np.where(alive, discount * step.rewards, 0.0)
         lengths += alive
@@ -476,60 +561,106 @@ def joined(parts: list[Outcomes]) -> Outcomes:
 
 
 class _EpisodeTable:
-    """Sums up the episodes that run in `len(gamma)` slots, each with its own discount."""
+    """The episodes that run in the slots of several rollouts, one rollout's after another's, and those that have ended.
 
-    def __init__(self, gamma: FloatArray) -> None:
-        n_slots = len(gamma)
-        self._gamma = gamma
-        self._count = 0
-        self._begun: list[tuple[IntArray, IntArray, IntArray]] = []  # ids, slots, starts
-        self._ended: list[tuple[Any, ...]] = []  # numbers, lengths, returns, discounted returns, success, ends
-        self._row_of, self._start_of = np.full(n_slots, -1), np.zeros(n_slots, dtype=np.int64)
-        self._returns, self._discounted, self._discount = np.zeros(n_slots), np.zeros(n_slots), np.ones(n_slots)
-        self._success = np.full(n_slots, np.nan)
-        self._time = 0
+    runs: (n_slots,) whether a slot has an episode.  contexts, seeds, returns: (n_slots, ...) of these.
+    actions: (steps, n_slots, ...) given before this round, as in `Unfinished`.  ended: how many have.
+    """
 
-    def __len__(self) -> int:
-        return self._count
+    def __init__(self, rollouts: Sequence[Rollout], slots: int) -> None:
+        known = [rollout.unfinished or _nothing(rollout, slots) for rollout in rollouts]
 
-    def begin(self, slots: IntArray, ids: IntArray, time: int) -> None:
-        self._row_of[slots] = self._count + np.arange(len(slots))
-        self._start_of[slots] = time
-        self._count += len(slots)
-        self._begun.append((ids, slots, np.full(len(slots), time)))
-        self._returns[slots], self._discounted[slots], self._discount[slots] = 0.0, 0.0, 1.0
+        def column(name: str) -> NDArray[Any]:
+            return np.concatenate([getattr(one, name) for one in known])
 
-    def add(self, rewards: FloatArray, success: NDArray[np.bool_] | None) -> None:
-        self._returns += rewards
+        self._slots = slots
+        self._gamma = np.repeat([rollout.gamma for rollout in rollouts], slots)
+        self._ids, self.contexts, self.seeds = column("ids"), column("contexts"), column("seeds")
+        self.returns, self._discounted, self._discount = (
+            column(name) for name in ("returns", "discounted_returns", "discounts")
+        )
+        self._starts = -column("lengths")  # at which step of this round; negative: before it
+        self.runs = self._starts < 0
+        self.actions = _side_by_side([one.actions for one in known], slots)
+        self.ended = 0
+        self._ended: list[tuple[Any, ...]] = []  # in the order of the fields of `Episodes`
+
+    def lengths(self, time: int) -> IntArray:
+        """`(n_slots,)` steps that the running episodes have made, before step `time` of this round."""
+        return time - self._starts
+
+    def begin(self, slots: IntArray, ids: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64], time: int) -> None:
+        self._ids[slots], self.contexts[slots], self.seeds[slots] = ids, contexts, seeds
+        self._starts[slots], self.runs[slots] = time, True
+        self.returns[slots], self._discounted[slots], self._discount[slots] = 0.0, 0.0, 1.0
+
+    def add(self, rewards: FloatArray) -> None:
+        self.returns += rewards
         self._discounted += self._discount * rewards
         self._discount *= self._gamma
-        if success is not None:
-            self._success = success.astype(np.float64)
-        self._time += 1
 
-    def end(self, slots: IntArray, ends: IntArray) -> None:
+    def end(self, slots: IntArray, time: int, success: NDArray[np.bool_] | None) -> None:
+        if not len(slots):
+            return
+        reached = np.full(len(slots), np.nan) if success is None else success[slots].astype(np.float64)
         self._ended.append(
-            (self._row_of[slots], self._time - self._start_of[slots], self._returns[slots], self._discounted[slots],
-             self._success[slots], ends)
+            (self._ids[slots], self.contexts[slots], slots, np.full(len(slots), time), time + 1 - self._starts[slots],
+             self.returns[slots], self._discounted[slots], reached)
         )  # fmt: skip
-        self._row_of[slots] = -1
-
-    def running(self) -> IntArray:
-        return np.flatnonzero(self._row_of >= 0)
+        self.runs[slots] = False
+        self.ended += len(slots)
 
     def episodes(self, owners: int) -> list[Episodes]:
-        """Every owner's own, where owners have equally many slots, one after another."""
-        slots_each = len(self._gamma) // owners
-        ids, slots, starts = (np.concatenate(column) for column in zip(*self._begun, strict=True))
-        rows, *sums = (np.concatenate(column) for column in zip(*self._ended, strict=True))
-        order = np.argsort(rows)
-        lengths, returns, discounted, success, ends = (column[order] for column in sums)
-        owner = slots // slots_each
+        """Every owner's own that have ended."""
+        if not self._ended:
+            none, numbers = np.zeros(0, dtype=np.int64), np.zeros(0)
+            return [Episodes(none, self.contexts[:0], none, none, none, numbers, numbers, numbers)] * owners
+        ids, contexts, slots, *others = (np.concatenate(column) for column in zip(*self._ended, strict=True))
+        owner = slots // self._slots
         return [
-            Episodes(
-                ids=ids[mine], slots=slots[mine] % slots_each, starts=starts[mine], lengths=lengths[mine],
-                returns=returns[mine], discounted_returns=discounted[mine], success=success[mine], ends=ends[mine],
-            )
+            Episodes(ids[mine], contexts[mine], slots[mine] % self._slots, *(column[mine] for column in others))
             for index in range(owners)
             for mine in [owner == index]
-        ]  # fmt: skip
+        ]
+
+    def unfinished(self, owners: int, executed: NDArray[np.generic]) -> list[Unfinished]:
+        """Every owner's own that run on, after the actions `executed` (length, n_slots, ...) of this round."""
+        runs, time = self.runs, len(executed)
+        lengths = np.where(runs, self.lengths(time), 0)
+        actions = np.concatenate([self.actions, executed]) if len(self.actions) else executed
+        actions = actions[len(actions) - lengths.max() :].copy()
+        early = np.arange(len(actions))[:, None] < len(actions) - lengths
+        actions[early] = 0
+        found = []
+        for index in range(owners):
+            mine = slice(index * self._slots, (index + 1) * self._slots)
+            running, steps = runs[mine], int(lengths[mine].max())
+            found.append(
+                Unfinished(
+                    ids=np.where(running, self._ids[mine], 0),
+                    contexts=np.where(running[:, None], self.contexts[mine], 0.0),
+                    seeds=np.where(running, self.seeds[mine], np.uint64(0)), lengths=lengths[mine].copy(),
+                    returns=np.where(running, self.returns[mine], 0.0),
+                    discounted_returns=np.where(running, self._discounted[mine], 0.0),
+                    discounts=np.where(running, self._discount[mine], 0.0),
+                    actions=actions[len(actions) - steps :, mine].copy(),
+                )
+            )  # fmt: skip
+        return found
+
+
+def _nothing(rollout: Rollout, slots: int) -> Unfinished:
+    """That no episode runs in a shard's slots."""
+    zeros, whole = np.zeros(slots), np.zeros(slots, dtype=np.int64)
+    contexts = np.zeros((slots, rollout.selection.contexts.shape[1]))
+    return Unfinished(whole, contexts, whole.astype(np.uint64), whole, zeros, zeros, zeros, np.zeros((0, slots)))
+
+
+def _side_by_side(actions: Sequence[NDArray[np.generic]], slots: int) -> NDArray[np.generic]:
+    """`(steps, all slots, ...)` from the recorded actions of several shards, whose last steps are everybody's last."""
+    longest = max(actions, key=len)
+    joined = np.zeros((len(longest), len(actions) * slots, *longest.shape[2:]), dtype=longest.dtype)
+    for index, mine in enumerate(actions):
+        if len(mine):
+            joined[len(longest) - len(mine) :, index * slots : (index + 1) * slots] = mine
+    return joined

@@ -2,7 +2,7 @@
 
     select   curriculum.start()                          one instance (SPaCE), all (round robin), ...
     repeat
-        collect  cluster.collect(policy, selection)      exactly n_steps transitions, in shards
+        collect  cluster.collect(policy, selection, walk)  exactly n_steps transitions, in shards; episodes go on
         update   learner.update(shards)                  SB3's own train()
         until the selection was passed over once at full horizon (draws: after one update), then
         revalue  cluster.start_values(policy)            V(s0, c) of every instance, straight to the curriculum
@@ -39,6 +39,7 @@ from space_dist.config import PPOConfig, RunConfig, TRPOConfig
 from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
+from space_dist.episodes import joined_episodes, mean_sizes, summed, told
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
 from space_dist.learner import (
@@ -57,16 +58,9 @@ from space_dist.learner import (
 )
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
 from space_dist.policy import MlpPolicy, Policy, Several, Statistics, blind, members_of, to_arrays
-from space_dist.rollout import (
-    CUT,
-    Outcomes,
-    Setup,
-    Shard,
-    Split,
-    Walk,
-    joined,
-)
+from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
 from space_dist.seeding import member_seeds
+from space_dist.walk import Unfinished, Walk, stacked, unstacked
 
 log = logging.getLogger("space_dist")
 
@@ -101,12 +95,6 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         raise ConfigError(
             f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
             + (", and the round before it that gives normalisation its first scales" if probes else "")
-        )
-    if setup.slot_length < horizon:
-        raise ConfigError(
-            f"learner.n_steps / (rollout.shards * rollout.slots) = {config.learner.n_steps} / ({config.rollout.shards} "
-            f"* {config.rollout.slots}) = {setup.slot_length} steps per slot, less than the horizon of "
-            f"{config.env.id} ({horizon}): no episode could end. Use fewer shards or slots, or larger updates"
         )
     env = make_env(config)
     refuse_spaces(config.learner, env.observation_space, env.action_space)
@@ -192,12 +180,12 @@ class _Run:
 
     round: int = 0
     steps: int = 0  # real environment steps
-    episodes: int = 0  # of training, begun
+    episodes: int = 0  # of training, ended
     iteration: int = 1
     rounds_left: int | None = None  # in this iteration; None until the selection is known
     version: int = 0  # of the selection being trained on
     walk: Walk = field(default_factory=lambda: Walk(-1, ()))
-    came_from: Walk = field(default_factory=lambda: Walk(-1, ()))  # the walk of the round that is learned from
+    sizes: NDArray[np.float64] | None = None  # (slots,) sums of |GAE| over running episodes, where anyone asks
     rows: int = 0
     evaluated_at: int = -1  # steps
     rollouts: list[dict[str, float]] = field(default_factory=list)  # of this iteration's rounds
@@ -328,13 +316,16 @@ class Training:
         return policy
 
     def _probe(self) -> Work[None]:
-        """One round of actions that ignore the observation gives the first scales; its steps count like any others."""
+        """One round of actions that ignore the observation gives the first scales; its steps count like any others.
+
+        Its episodes are not gone on with: they say nothing about the policy.
+        """
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
         (seeing,) = members_of(self.learner.policy(0))
         policy = blind(seeing, self._setup.make_env(1).action_space, PROBE)
         handles = cluster.collect(
-            cluster.put(policy), cluster.put(selection), run.walk, round=PROBE, steps=0, version=selection.version
+            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=PROBE, steps=0, version=selection.version
         )  # fmt: skip
         shards: list[Shard] = yield Wait(handles)
         self.learner.observe(shards)
@@ -391,7 +382,7 @@ class Training:
         if self.ensemble is not None:
             members = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
         if wants.episodes:
-            seen = _joined_episodes(run.seen)
+            seen = joined_episodes(run.seen)
             episodes = [cluster.put(seen)]
             if (seen.indices == GENERATED).any():
                 context_values = cluster.context_values(policy, seen.contexts, version=run.version)
@@ -415,7 +406,7 @@ class Training:
     def _know_selection(self, selection: Selection) -> None:
         run, config = self._run, self._config
         episodes = config.rollout.passes * len(selection.ids)
-        per_round = config.n_episodes or config.learner.n_steps * config.members / self._horizon
+        per_round = config.n_episodes or config.learner.n_steps / self._horizon  # of each policy: all pass over it
         run.rounds_left = 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
         run.trained = selection
         if not selection.drawn:
@@ -466,14 +457,10 @@ class Training:
         selection = run.trained
         if selection is None or run.rounds_left is None:
             raise RuntimeError("a round ended before its selection was known")
-        run.came_from, n_shards = run.walk, len(shards)
-        run.walk = Walk(
-            shards[0].order_version,
-            tuple(
-                (run.walk.position(selection, shard.shard, n_shards) + len(shard.episodes)) % len(selection.ids)
-                for shard in shards
-            ),
-        )
+        run.walk = run.walk.after(
+            selection, [shard.begun for shard in shards], [shard.unfinished for shard in shards],
+            n_shards=self._setup.walks,
+        )  # fmt: skip
         run.round += 1
         run.rounds_left -= 1
         run.steps += sum(shard.steps for shard in shards)
@@ -491,17 +478,21 @@ class Training:
 
     def _account(self, shards: list[Shard], update: Update) -> None:
         """Note what a round's episodes and its update showed."""
-        run, selection = self._run, self._run.trained
-        if selection is not None and self._curriculum.wants.episodes:
-            places = [
-                run.came_from.places(selection, shard.shard, len(shards), len(shard.episodes)) for shard in shards
-            ]
-            run.seen.append(
-                _episodes(self._setup.train, selection, np.concatenate(places), shards, update.advantages)
-            )  # fmt: skip
-        run.rollouts.append(_rollout_sums(shards, lag=run.round - 1 - shards[0].policy_version))
+        run, wants = self._run, self._curriculum.wants
+        if wants.episodes:
+            run.seen.append(told(self._setup.train, shards, self._advantages(shards, update)))
+        run.rollouts.append(summed(shards, lag=run.round - 1 - shards[0].policy_version))
         run.updates.append(update.metrics)
         run.gradient_steps += update.gradient_steps
+
+    def _advantages(self, shards: list[Shard], update: Update) -> NDArray[np.float64] | None:
+        """`(m,)` the mean |GAE| of each episode that ended, if the curriculum asks for it, earlier rounds included."""
+        run = self._run
+        if not self._curriculum.wants.advantages or update.advantages is None:
+            return None
+        before = np.zeros(update.advantages.shape[1]) if run.sizes is None else run.sizes
+        means, run.sizes = mean_sizes(shards, update.advantages, before)
+        return means
 
     def _finish(self) -> Work[None]:
         run = self._run
@@ -533,24 +524,23 @@ class Training:
         if run.trained is None:
             raise RuntimeError("an iteration ended before its selection was known")
         trained: Row = {"trained": run.trained.ids.tolist()}
-        if run.trained.drawn:  # the draws that became episodes
-            seen = _joined_episodes(run.seen)
+        if run.trained.drawn:  # the draws whose episodes ended
+            seen = joined_episodes(run.seen)
             generated = seen.indices == GENERATED
             trained = {"trained": np.where(generated, GENERATED, self._setup.train.ids[seen.indices]).tolist()}
             trained |= {"contexts": seen.contexts.tolist()} if generated.any() else {}
         self._writer.append(CURRICULUM, {"iteration": run.iteration, "steps": run.steps, **trained})
         totals = {name: sum(one[name] for one in run.rollouts) for name in run.rollouts[0]}
-        finished = totals["finished"]
+        episodes = int(totals["episodes"])
         return {
             "kind": "iteration",
             **self._position(),
             "complete": complete,
-            "episodes": int(totals["episodes"]),
-            "episodes_cut": int(totals["cut"]),
+            "episodes": episodes,
             "gradient_steps": run.gradient_steps,
             **({"lagged_steps": int(totals["lagged"])} if self._config.rollout.overlap else {}),
             "rollout": {
-                name: totals[name] / finished if finished and math.isfinite(totals[name]) else None
+                name: totals[name] / episodes if episodes and math.isfinite(totals[name]) else None
                 for name in ("return", "discounted_return", "length", "success")
             },
             "learner": {
@@ -612,7 +602,10 @@ class Training:
         arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
         arrays |= {f"acted/{name}": array for name, array in (run.acted or {}).items()}
         if run.seen:
-            arrays |= {f"seen/{name}": array for name, array in vars(_joined_episodes(run.seen)).items()}
+            arrays |= {f"seen/{name}": array for name, array in vars(joined_episodes(run.seen)).items()}
+        arrays |= {f"unfinished/{name}": array for name, array in stacked(run.walk).items()}
+        if run.sizes is not None:
+            arrays["sizes"] = run.sizes
         if self.ensemble is not None:
             arrays |= {f"ensemble/{name}": array for name, array in self.ensemble.save().items()}
         self._store_transitions()
@@ -642,6 +635,8 @@ class Training:
 
     def _restore(self, checkpoint: Checkpoint) -> Handle:
         run, cluster, data = self._run, self._cluster, checkpoint.data["run"]
+        order, positions = data["walk"]
+        run.walk = Walk(order, tuple(positions), self._unfinished(checkpoint) if positions else ())
         _load_learner(self.learner, checkpoint)
         run.segments = list(checkpoint.segments)
         for segment in run.segments:
@@ -651,9 +646,8 @@ class Training:
             "gradient_steps",
         ):  # fmt: skip
             setattr(run, name, data[name])
-        order, positions = data["walk"]
-        run.walk = Walk(order, tuple(positions))
         arrays = checkpoint.arrays
+        run.sizes = arrays.get("sizes")
         state = decode_state(
             self._curriculum.state_type, _under("curriculum/", arrays), checkpoint.data["curriculum"]
         )  # fmt: skip
@@ -672,6 +666,14 @@ class Training:
             run.acted = acted
             run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
+
+    def _unfinished(self, checkpoint: Checkpoint) -> tuple[Unfinished, ...]:
+        """The episodes that run. Raises SpaceDistError if a checkpoint's cannot be this run's."""
+        setup, env = self._setup, make_env(self._config)
+        return unstacked(
+            _under("unfinished/", checkpoint.arrays), shards=setup.shards, slots=setup.slots,
+            features=len(setup.train.names), horizon=env.horizon, action_shape=env.action_space.shape or (),
+        )  # fmt: skip
 
     def _show(self) -> None:
         self.progress.steps = self._run.steps
@@ -787,52 +789,6 @@ def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int
         marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
         return next(mark for mark in marks if mark > evaluated_at)
     return (evaluated_at // every_steps + 1) * every_steps
-
-
-def _episodes(
-    train: InstanceSet, selection: Selection, places: NDArray[np.int64], shards: Sequence[Shard],
-    advantages: NDArray[np.float64] | None,
-) -> Episodes:  # fmt: skip
-    """A round's episodes, which stand at `places` in the selection, for the curriculum; start values are not known."""
-    tables = [shard.episodes for shard in shards]
-
-    def column(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(table, name) for table in tables])
-
-    ids, unknown = column("ids"), np.full(len(places), np.nan)
-    return Episodes(
-        indices=np.where(ids == GENERATED, GENERATED, np.searchsorted(train.ids, ids)),
-        contexts=selection.contexts[places],
-        returns=column("returns"), discounted_returns=column("discounted_returns"), lengths=column("lengths"),
-        success=column("success"), finished=column("ends") != CUT, start_values=unknown,
-        advantages=unknown if advantages is None else advantages,
-    )  # fmt: skip
-
-
-def _joined_episodes(parts: Sequence[Episodes]) -> Episodes:
-    """The episodes of all rounds of an iteration, in order."""
-    names = [field.name for field in dataclasses.fields(Episodes)]
-    return Episodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
-
-def _rollout_sums(shards: list[Shard], *, lag: int) -> dict[str, float]:
-    """Sums over a round's finished episodes (cut ones have no return), and how many there were.
-
-    lag: updates that the acting weights were behind.
-    """
-    sums = {"lagged": float(lag * sum(shard.steps for shard in shards))}
-    sums |= dict.fromkeys(("episodes", "cut", "finished", "return", "discounted_return", "length", "success"), 0.0)
-    for shard in shards:
-        episodes = shard.episodes
-        finished = episodes.ends != CUT
-        sums["episodes"] += len(episodes)
-        sums["cut"] += int((~finished).sum())
-        sums["finished"] += int(finished.sum())
-        sums["return"] += float(episodes.returns[finished].sum())
-        sums["discounted_return"] += float(episodes.discounted_returns[finished].sum())
-        sums["length"] += float(episodes.lengths[finished].sum())
-        sums["success"] += float(episodes.success[finished].sum())
-    return sums
 
 
 def _summary(outcomes: Outcomes, instances: int, episodes: int) -> dict[str, Any]:

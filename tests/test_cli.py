@@ -78,7 +78,6 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (train("env.id=os:no_such_function"), ["env.id", "no_such_function"]),
         (train("env.kwargs={no_such: 1}"), ["env.kwargs", "no_such"]),
         (train("env.context_visible=false"), ["all values tie", "env.context_visible"]),
-        (train("learner.n_steps=256"), ["horizon", "(100)", "64 steps per slot"]),
         (train("learner.kind=dqn"), ["learner"]),
         (train("instances.train=nowhere.csv"), ["nowhere.csv"]),
         (train(f"instances.train={TEST}"), ["overlap", "id 100"]),

@@ -61,7 +61,7 @@ def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -
     with cluster_class(run, setup) as cluster:
         policy = cluster.put(learner_of(run).policy(0))
         decision = cluster.begin(cluster.start_values(policy))
-        from space_dist.rollout import Walk
+        from space_dist.walk import Walk
 
         shards = cluster.collect(policy, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
         assert len(cluster.get([*shards, *cluster.evaluate(policy, "test")])) == 2 * run.rollout.shards

@@ -445,7 +445,7 @@ def points_of(ledger: Ledger) -> list[tuple[str, int, int, float]]:
         numbers = {f"{section}/{key}": value for section in ("train", "test", "rollout", "learner", "curriculum")
                    for key, value in row.get(section, {}).items()}  # fmt: skip
         if row["kind"] == "iteration":
-            numbers |= {key: row[key] for key in ("iteration", "round", "episodes", "episodes_cut")}
+            numbers |= {key: row[key] for key in ("iteration", "round", "episodes")}
         numbers["timing/steps_per_second"] = timing["steps_per_second"]
         points += [(key, round(timing["unix_time"] * 1000), row["steps"], float(value))
                    for key, value in numbers.items() if isinstance(value, int | float)]  # fmt: skip

@@ -24,7 +24,8 @@ from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.learner import Learner, OnPolicyLearner, make_learner
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
-from space_dist.rollout import Episodes, Rollout, Shard, collect
+from space_dist.rollout import Episodes, Rollout, Shard, Stage, collect
+from space_dist.walk import Unfinished
 
 POINTMASS, LINE, DISCRETE_LINE = "space_dist/PointMass-v0", "tests.tiny_env:make", "tests.tiny_env:make_discrete"
 SLOTS, LENGTH = 3, 16  # per shard, where nothing else is said
@@ -56,7 +57,9 @@ def shards_of(learner: Learner, env_id: str = LINE, *, round: int = 0, length: i
     selection = Selection(0, np.arange(5), contexts, 0)
     policy = learner.policy(round)
     return [
-        collect(env, [Rollout(policy, selection, 2 * shard, 0.9, seed=1, round=round, shard=shard)], length=length)[0]
+        collect(
+            Stage(env), [Rollout(policy, selection, 2 * shard, 0.9, seed=1, round=round, shard=shard)], length=length
+        )[0]
         for shard in range(n)
     ]
 
@@ -89,7 +92,9 @@ def hand_made(rewards: Any, terminated: Any, truncated: Any, *, shard: int = 0) 
         terminated=terminated, truncated=truncated,
         last_observations=np.zeros((slots, 2), dtype=np.float32),
         truncated_observations=np.zeros((int(truncated.sum()), 2), dtype=np.float32), next_observations=None,
-        episodes=Episodes(none, none, none, none, nothing, nothing, nothing, none),
+        starts=np.ones(slots, dtype=np.bool_), begun=slots,
+        episodes=Episodes(none, np.zeros((0, 1)), none, none, none, nothing, nothing, nothing),
+        unfinished=Unfinished(none, nothing, none, none, nothing, nothing, nothing, nothing),
     )  # fmt: skip
 
 
@@ -194,12 +199,12 @@ def test_buffer_equals_stable_baselines3s_own_collecting(env_id: str, length: in
         assert ours[name].dtype == theirs.dtype, name
         np.testing.assert_allclose(ours[name], theirs, rtol=1e-5, atol=1e-5, err_msg=name)
 
-    ends = np.concatenate([shard.episodes.ends for shard in shards])
+    running = np.concatenate([shard.unfinished.lengths for shard in shards])
     if env_id == POINTMASS:
         assert env.terminated.any()
-        assert length < 200 or env.truncated[-1].any()  # bootstrapped as a timeout, not as a cut
+        assert length < 200 or env.truncated[-1].any()  # bootstrapped as a timeout, not as one that goes on
     assert env.truncated.any()
-    assert (ends == 2).any()
+    assert (running > 0).any()
     low, high = getattr(env.action_space, "low", 0), getattr(env.action_space, "high", 2)
     assert all((given >= low).all() and (given <= high).all() for given in env.given)
 
@@ -207,7 +212,7 @@ def test_buffer_equals_stable_baselines3s_own_collecting(env_id: str, length: in
 @pytest.mark.parametrize("kind", ["ppo", "trpo"])
 def test_advantages_by_hand(kind: str) -> None:
     # V = 4 everywhere, rewards 1, gamma 1/2, lambda 1/2: delta = 1 + 2 - 4 = -1, and 1 - 4 = -3 at a terminal step;
-    # A_t = delta_t + A_{t+1} / 4 within an episode. Beyond a cut and a timeout the value is 4 all the same.
+    # A_t = delta_t + A_{t+1} / 4 within an episode. Beyond the round and a timeout the value is 4 all the same.
     config = small(kind, gamma=0.5, gae_lambda=0.5, n_steps=16)
     learner = OnPolicyLearner(config, BOX, BOX, seed=0, n_slots=4, slot_length=4, total_steps=16)
     with torch.no_grad():

@@ -25,15 +25,16 @@ from space_dist.learner.networks import TorchPolicy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, decode_checkpoint
 from space_dist.policy import MlpPolicy
-from space_dist.rollout import Walk, Worker
+from space_dist.rollout import Worker
 from space_dist.training import learner_of, make_setup
+from space_dist.walk import Walk
 from tests.test_learner import hand_made
 
 LINE, DISCRETE_LINE, SCALED = "tests.tiny_env:make", "tests.tiny_env:make_discrete", "tests.tiny_env:make_scaled"
 IMAGE, PARTS = "tests.tiny_env:make_image", "tests.tiny_env:make_dict"
 KINDS = ("ppo", "a2c", "trpo", "dqn", "sac", "td3")
 RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
-N_STEPS, ROUNDS = 64, 6
+N_STEPS, ROUNDS = 40, 6  # five steps a slot: episodes, of eight, go on from round to round
 
 LEARNERS: dict[str, dict[str, Any]] = {
     "ppo": {"batch_size": 32, "n_epochs": 2},
@@ -199,9 +200,9 @@ def segments_named(folder: Path) -> list[set[str]]:
 def test_only_pieces_that_a_checkpoint_names_are_kept(references: Any) -> None:
     _, folder, _ = references["dqn"]
     named = segments_named(folder)
-    # 150 transitions are those of the last three rounds, a part of the first of them; each checkpoint's own.
-    assert named[-1] == {f"{first:012d}-{first + 64:012d}.npz" for first in (128, 192, 256)}
-    assert named[0] == {f"{first:012d}-{first + 64:012d}.npz" for first in (192, 256, 320)}
+    # 150 transitions are those of the last four rounds, a part of the first of them; each checkpoint's own.
+    assert named[-1] == {f"{first:012d}-{first + 40:012d}.npz" for first in (40, 80, 120, 160)}
+    assert named[0] == {f"{first:012d}-{first + 40:012d}.npz" for first in (80, 120, 160, 200)}
     assert {file.name for file in Ledger(folder).replay.iterdir()} == set.union(*named), "a checkpoint lacks a piece"
     assert not Ledger(references["ppo"][1]).replay.exists()
 
@@ -630,7 +631,6 @@ def test_rounds_of_one_episode_and_a_budget_of_episodes(tmp_path: Path) -> None:
     assert [row["steps"] for row in iterations] == [expected[3], expected[7], expected[9]]  # four rounds are a pass
     assert [row["complete"] for row in iterations] == [True, True, False]
     assert sum(row["episodes"] for row in iterations) == 10
-    assert sum(row["episodes_cut"] for row in iterations) == 0
     learnt = sum(after - before for before, after in zip([0, *expected], expected, strict=False) if after > 3)
     assert sum(row["gradient_steps"] for row in iterations) == learnt
     assert Ledger(tmp_path / "run").status().steps == expected[-1]
@@ -655,7 +655,7 @@ def test_a_budget_of_steps_ends_rounds_of_episodes_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["ppo", "trpo", "a2c"])
 def test_rounds_collected_ahead_are_the_same_wherever_and_after_any_interruption(kind: str, tmp_path: Path) -> None:
     curriculum = {"kind": "round_robin"}  # two rounds an iteration
-    settings = {"rollout": {"shards": 4, "slots": 2, "overlap": True, "passes": 4.0}, "curriculum": curriculum}
+    settings = {"rollout": {"shards": 4, "slots": 2, "overlap": True, "passes": 2.5}, "curriculum": curriculum}
     config = config_for(tmp_path, learner_section(kind), **settings)
     expected = run(config, tmp_path / "reference")
     iterations = [row for row in Ledger(tmp_path / "reference").rows() if row["kind"] == "iteration"]
@@ -705,7 +705,7 @@ def test_overlap_is_refused_where_it_cannot_be(kind: str, changes: Any, words: s
 @pytest.mark.ray
 @pytest.mark.usefixtures("one_ray")
 def test_rounds_collected_ahead_by_actors_are_the_same(tmp_path: Path) -> None:
-    rollout = {"shards": 4, "slots": 2, "overlap": True, "passes": 4.0}
+    rollout = {"shards": 4, "slots": 2, "overlap": True, "passes": 2.5}
     config = config_for(tmp_path, learner_section("ppo"), rollout=rollout, curriculum={"kind": "round_robin"})
     there = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 2})})
     assert run(there, tmp_path / "actors") == run(config, tmp_path / "here")

@@ -22,8 +22,9 @@ from space_dist.curricula import Selection
 from space_dist.learner import OffPolicyLearner, make_learner
 from space_dist.learner.interface import _seeded
 from space_dist.policy import Exploration, Head, MlpPolicy, Noise
-from space_dist.rollout import Setup, Shard, Walk, Worker
+from space_dist.rollout import Setup, Shard, Worker
 from space_dist.seeding import Purpose, generator
+from space_dist.walk import Walk
 from tests.test_learner import bits, hand_made
 from tests.test_rollout import setup_for
 
@@ -333,7 +334,7 @@ def collected(kind: str, head: Head, before: int) -> tuple[list[Shard], list[Noi
     policy = MlpPolicy(4, "relu", head, (layer,), ())
     asked = {"round": 4, "steps": before, "selection_version": 0}
     shards = [worker.collect(policy, selection(), Walk(-1, ()), shard=shard, **asked) for shard in range(setup.shards)]
-    space = worker._collecting.action_space
+    space = setup.make_env(1).action_space
     noise = [Noise.draw(head, space, generator(setup.seed, Purpose.ACTIONS, 4, shard), (16, 4)) for shard in range(3)]
     return shards, noise, policy
 

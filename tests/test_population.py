@@ -13,6 +13,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from space_dist import rollout
 from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
@@ -20,11 +21,12 @@ from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, launch, policy_of, read_instances
 from space_dist.learner import CoupledLearner
-from space_dist.ledger import Ledger
+from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.policy import members_of
 from space_dist.population import advance, member
-from space_dist.rollout import Walk, Worker
+from space_dist.rollout import Shard, Worker
 from space_dist.training import learner_of, make_setup, memory_of
+from space_dist.walk import Walk
 from tests.grids import ROOT
 from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results
 from tests.tiny_env import Line
@@ -87,6 +89,14 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
             assert results(folder) == expected[number]
             assert Ledger(folder).status().state == "done"
     assert len({content["metrics.jsonl"] for content in expected}) == 4
+
+
+def test_members_that_stay_together_play_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    configs = [configured(tmp_path / str(number), number) for number in range(3)]
+    played, replayed = [], rollout._replayed
+    monkeypatch.setattr(rollout, "_replayed", lambda env, table: played.append(1) or replayed(env, table))
+    together(configs, [tmp_path / f"run{number}" for number in range(3)])
+    assert len(played) == 1  # the first round's, of nothing
 
 
 def test_its_learning_is_stable_baselines3s_up_to_rounding(tmp_path: Path) -> None:
@@ -248,6 +258,39 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
         assert made.gradient_steps == update.gradient_steps
     ours, theirs = learner.scored(), alone.scored()
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_each_of_them_meets_the_whole_selection_in_every_iteration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole passes of each policy, whatever the order, which is another one in every iteration."""
+    met: dict[tuple[int, int], set[float]] = {}  # by selection and policy: targets
+    learn = CoupledLearner.parts
+
+    def noted(self: CoupledLearner, shards: Sequence[Shard]) -> list[list[Shard]]:
+        for number, mine in enumerate(parts := learn(self, shards)):
+            for shard in mine:
+                seen = shard.observations[..., -1]  # type: ignore[call-overload]
+                met.setdefault((shard.selection_version, number), set()).update(seen.ravel().tolist())
+        return parts
+
+    monkeypatch.setattr(CoupledLearner, "parts", noted)
+    grows = {"kind": "random_growth", "growth": "add", "kappa": 4, "eta": 1e9}
+    config = coupled(
+        tmp_path, curriculum={**grows, "aggregate": "population", "policies": 4},
+        budget={"steps": 4 * 12 * N_STEPS}, rollout={"shards": 2, "slots": 1, "passes": 2.0},
+    )  # fmt: skip
+    targets = np.linspace(-0.9, 0.9, 12)
+    write_set(tmp_path / "train.csv", targets)
+    alone(config, tmp_path / "run")
+    rows = [row for row in Ledger(tmp_path / "run").rows() if row["kind"] == "iteration" and row["complete"]]
+    for version, row in enumerate(rows):
+        trained = row["curriculum"]["trained_size"]
+        assert row["round"] - (rows[version - 1]["round"] if version else 0) == max(1, -(-2 * trained * 8 // N_STEPS))
+        wanted = targets[Ledger(tmp_path / "run").rows(CURRICULUM)[version]["trained"]]
+        for policy in range(4):
+            assert np.isclose(wanted[:, None], list(met[version, policy]), atol=1e-4).any(axis=1).all()
+    assert rows[-1]["curriculum"]["trained_size"] == 12
 
 
 def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:

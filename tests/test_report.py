@@ -111,7 +111,7 @@ def continue_run(
                 size = len(trained[number - 1])
                 numbers_ = {"size": len(trained[min(number, len(trained) - 1)]), "trained_size": size, "grew": True,
                             "mean_value_before": -0.5, "mean_value_after": None}  # fmt: skip
-                add({"kind": "iteration", **position, "complete": True, "episodes": 20, "episodes_cut": 3,
+                add({"kind": "iteration", **position, "complete": True, "episodes": 20,
                      "rollout": {"return": -9.0 + number, "discounted_return": None, "length": 50.0, "success": None},
                      "learner": {"loss": 1.0 / number, "clip_fraction": 0.25}, "curriculum": numbers_})  # fmt: skip
             evaluated = {}

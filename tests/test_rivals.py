@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -38,13 +39,15 @@ from space_dist.curricula.learnability import Learnability, learnable_chances
 from space_dist.curricula.plr import LevelReplay, ReplayState, replay_chances
 from space_dist.curricula.vds import ValueDisagreement, disagreement
 from space_dist.envs import make_batched
+from space_dist.episodes import mean_sizes
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
 from space_dist.learner import Ensemble, make_learner
-from space_dist.learner.on_policy import mean_sizes
 from space_dist.policy import EnsemblePolicy, Statistics
-from space_dist.rollout import Setup, Shard, Walk, Worker
+from space_dist.rollout import Episodes as Table
+from space_dist.rollout import Setup, Shard, Worker
 from space_dist.training import make_setup
+from space_dist.walk import Walk
 from tests.tiny_env import Line
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -61,14 +64,14 @@ def instances(n: int, **columns: Any) -> InstanceSet:
 
 def feedback(
     version: int, indices: Any, contexts: np.ndarray | None = None, *, n: int = 4, returns: Any = 0.0,
-    advantages: Any = math.nan, finished: Any = True, members: Any = None, probes: Probes | None = None,
+    advantages: Any = math.nan, members: Any = None, probes: Probes | None = None,
 ) -> Feedback:  # fmt: skip
     m = len(indices)
     broadcast = lambda value, kind=np.float64: np.broadcast_to(value, m).astype(kind)  # noqa: E731
     episodes = Episodes(
         indices=np.array(indices), contexts=np.zeros((m, 2)) if contexts is None else contexts,
         returns=broadcast(returns), discounted_returns=broadcast(0.0), lengths=broadcast(1, np.int64),
-        success=broadcast(0.0), finished=broadcast(finished, np.bool_), start_values=broadcast(0.0),
+        success=broadcast(0.0), start_values=broadcast(0.0),
         advantages=broadcast(advantages),
     )  # fmt: skip
     return Feedback(
@@ -84,7 +87,8 @@ def test_the_head_of_the_draws_is_dealt_to_the_walks_that_use_them_first() -> No
     dealt = Draws(count=6, walks=2).dealt(np.arange(6))
     assert dealt.tolist() == [0, 2, 4, 1, 3, 5]
     selection = dataclasses.replace(Uniform(instances(4), seed=0, draws=Draws(6, 2)).start()[1], ids=dealt)
-    walked = [dealt[Walk(-1, ()).places(selection, shard, 2, 3)].tolist() for shard in range(2)]
+    firsts = [Walk(-1, ()).position(selection, shard, 2) for shard in range(2)]
+    walked = [dealt[first : first + 3].tolist() for first in firsts]
     assert walked == [[0, 2, 4], [1, 3, 5]]
 
 
@@ -292,42 +296,55 @@ def test_what_was_never_trained_on_comes_first() -> None:
     assert state.last[trained].tolist() == [1, 0, 0]
 
 
+def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:
+    plr = LevelReplay(instances(5), seed=0, draws=Draws(40, 4), temperature=0.1, staleness_share=0.1)
+    state, selection = plr.start()
+    after, again, numbers = plr.step(state, feedback(0, np.zeros(0, dtype=np.int64), n=5, advantages=0.0))
+    assert (after.version, numbers["seen"], numbers["mean_score"]) == (1, 0, None)
+    assert set(again.ids) == set(selection.ids) == set(range(10, 15))
+
+
 def test_mean_advantages_of_episodes_by_hand() -> None:
-    numbers = np.array([[1.0, -4.0], [-3.0, 2.0], [5.0, 0.0]], dtype=np.float32)
+    def shard(slots: list[int], times: list[int], lengths: list[int], starts: list[bool]) -> Any:
+        whole = (np.array(column, dtype=np.int64) for column in (slots, times, lengths))
+        nothing = np.zeros(0)
+        slots_, times_, lengths_ = whole
+        table = Table(np.zeros(len(slots), dtype=np.int64), np.zeros((0, 1)), slots_, times_, lengths_, *[nothing] * 3)
+        return SimpleNamespace(episodes=table, rewards=np.zeros((3, len(starts))), starts=np.array(starts))
 
-    def shard(slots: list[int], starts: list[int], lengths: list[int], width: int) -> Any:
-        from types import SimpleNamespace
-
-        table = {"slots": np.array(slots), "starts": np.array(starts), "lengths": np.array(lengths)}
-        return SimpleNamespace(episodes=SimpleNamespace(**table), rewards=np.zeros((3, width)))
-
-    found = mean_sizes([shard([0, 0], [0, 2], [2, 1], 1), shard([0], [0], [3], 1)], numbers)
-    assert found.tolist() == [2.0, 5.0, 2.0]
+    # Slots 0 and 1 are one shard's, slot 2 the other's. Slot 0 goes on with an episode that had 7 in 2 steps, and ends
+    # it and another; slot 1 begins one that runs on; slot 2 goes on with one of 10, which ends at the last step.
+    sizes = np.array([[1.0, 4.0, 2.0], [3.0, 2.0, 3.0], [5.0, 0.5, 4.0]])
+    shards = [shard([0, 0], [0, 2], [3, 2], [False, True]), shard([0], [2], [8], [False])]
+    means, later = mean_sizes(shards, sizes, np.array([7.0, 100.0, 10.0]))
+    assert means.tolist() == [8.0 / 3, 4.0, 19.0 / 8]
+    assert later.tolist() == [0.0, 6.5, 0.0]
+    # The next round: nothing ends, slot 1 goes on, the others begin.
+    shards = [shard([], [], [], [True, False]), shard([], [], [], [True])]
+    means, later = mean_sizes(shards, sizes, later)
+    assert (means.tolist(), later.tolist()) == ([], [9.0, 13.0, 9.0])
 
 
 def test_advantages_are_those_of_generalised_advantage_estimation() -> None:
     config = vds_config("curriculum={kind: plr}", "learner.gae_lambda=0.5")
     _, learner, shards = tiny_shards(config)
-    policy = learner.policy(0)
-    expected = []
+    policy, expected = learner.policy(0), []
     for shard in shards:
-        truncated = {tuple(place): index for index, place in enumerate(np.argwhere(shard.truncated))}
-        for slot, start, length in zip(
-            shard.episodes.slots, shard.episodes.starts, shard.episodes.lengths, strict=True
-        ):
-            times = range(start, start + length)
-            values = [float(policy.values(shard.observations[time, slot][None])[0]) for time in times]  # type: ignore[index]
-            end = (start + length - 1, slot)
-            beyond = shard.truncated_observations[truncated[end]] if end in truncated else shard.last_observations[slot]  # type: ignore[index]
-            values.append(float(policy.values(beyond[None])[0]))
-            advantage, sizes = 0.0, []
-            for step in reversed(range(length)):
-                delta = shard.rewards[start + step, slot] + 0.5 * values[step + 1] - values[step]
-                advantage = delta + 0.5 * 0.5 * advantage
-                sizes.append(abs(advantage))
-            expected.append(np.mean(sizes))
+        length, slots = shard.rewards.shape
+        values = policy.values(shard.observations.reshape(-1, 2)).reshape(length, slots)  # type: ignore[union-attr]
+        last, truncated = policy.values(shard.last_observations), policy.values(shard.truncated_observations)
+        behind = {tuple(place): truncated[index] for index, place in enumerate(np.argwhere(shard.truncated))}
+        sizes, advantage = np.zeros((length, slots)), np.zeros(slots)
+        for time in reversed(range(length)):
+            for slot in range(slots):
+                following = last[slot] if time == length - 1 else values[time + 1, slot]
+                ended = (time, slot) in behind
+                delta = shard.rewards[time, slot] + 0.5 * behind.get((time, slot), following) - values[time, slot]
+                advantage[slot] = delta + (0.0 if ended else 0.5 * 0.5 * advantage[slot])
+                sizes[time, slot] = abs(advantage[slot])
+        expected.append(sizes)
     update = learner.update(shards, round=0, steps=128)
-    np.testing.assert_allclose(update.advantages, expected, atol=1e-4)
+    np.testing.assert_allclose(update.advantages, np.concatenate(expected, axis=1), atol=1e-4)
 
 
 # ---- learnability ---------------------------------------------------------------------------------------------------
@@ -442,14 +459,13 @@ def test_the_first_fit_comes_after_fit_rate_finished_episodes(from_set: bool) ->
     assert (selection.contexts >= BOUNDS.low).all()
     assert (selection.contexts <= BOUNDS.high).all()
     contexts = everyone.contexts[np.tile([0, 9], 8)]
-    finished = np.arange(16) != 3  # 15 finished episodes
-    told = feedback(0, [0] * 16, contexts, n=10, returns=np.arange(16.0), finished=finished)
+    told = feedback(0, [0] * 15, contexts[:15], n=10, returns=np.arange(15.0))
     state, _, numbers = one.step(state, told)
     assert (numbers["finished_episodes"], numbers["fitted"], len(state.means)) == (15, False, 0)
-    # Two contexts in turn, the fourth episode unfinished; returns are 0, 1, 2, 4, 5, ... The seventh finished episode
-    # is the first that has more than five before it. Each is compared with the oldest of its context: return 0 or 1.
-    assert state.returns.tolist() == [0.0, 1.0, 2.0, *range(4, 16)]
-    assert state.recent[:, -1].tolist() == [0.0] * 6 + [7.0 - 1.0, 8.0, 8.0, 10.0, 10.0, 12.0, 12.0, 14.0, 14.0]
+    # Two contexts in turn. The seventh episode is the first that has more than five before it. Each is compared with
+    # the oldest of its context: return 0 or 1.
+    assert state.returns.tolist() == np.arange(15.0).tolist()
+    assert state.recent[:, -1].tolist() == [0.0] * 6 + [6.0, 6.0, 8.0, 8.0, 10.0, 10.0, 12.0, 12.0, 14.0]
     state, selection, numbers = one.step(state, dataclasses.replace(told, version=1))
     assert (numbers["finished_episodes"], numbers["fitted"]) == (30, True)
     assert len(state.means) >= 2

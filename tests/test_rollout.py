@@ -22,21 +22,19 @@ from space_dist.learner import make_learner
 from space_dist.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
 from space_dist.rollout import (
     CHUNK,
-    CUT,
-    TERMINATED,
-    TRUNCATED,
     Outcomes,
     Rollout,
     Setup,
     Shard,
+    Stage,
     Trial,
-    Walk,
     Worker,
     collect,
     evaluate,
     joined,
 )
 from space_dist.seeding import Purpose, episode_seeds, generator
+from space_dist.walk import Walk
 from tests import tiny_env
 
 POINTMASS = "space_dist/PointMass-v0"
@@ -224,7 +222,7 @@ def test_discrete_actions_are_drawn_from_the_softmax() -> None:
     env = make_batched("tests.tiny_env:make_discrete", 256, context_visible=True)
     weights = weights_for(2, 3, discrete=True)
     contexts = np.random.default_rng(0).uniform(-1.0, 1.0, size=(50, 1))
-    (shard,) = collect(env, [Rollout(weights, select(contexts), 0, 0.9, seed=0, round=0, shard=0)], length=160)
+    (shard,) = collect(Stage(env), [Rollout(weights, select(contexts), 0, 0.9, seed=0, round=0, shard=0)], length=160)
     outputs = forward(weights.actor, weights.activation, shard.observations.reshape(-1, 2)).astype(np.float64)
     chances = np.exp(outputs - outputs.max(axis=1, keepdims=True))
     chances /= chances.sum(axis=1, keepdims=True)
@@ -246,27 +244,37 @@ def by_hand(lengths: list[float], *, start: int, length: int, slots: int = 2) ->
     contexts = np.array(lengths)[:, None]
     selection = select(contexts, ids=10 * np.arange(len(lengths)))
     rollout = Rollout(weights_for(2, 1), selection, start, gamma=0.5, seed=1, round=0, shard=0)
-    return collect(Countdown(slots), [rollout], length=length)[0]
+    return collect(Stage(Countdown(slots)), [rollout], length=length)[0]
 
 
 def test_the_walk_by_hand() -> None:
     # Instances 0, 10, 20 live 2, 3 and 9 steps (the last is truncated after 5); the walk starts at instance 10.
     #   time    0  1  2  3  4  5  6  7
-    #   slot 0  10 10 10 10 10 10 20 20     first 10 (0-2), then 10 again (3-5), then 20 (6-, cut)
-    #   slot 1  20 20 20 20 20 0  0  10     20 (0-4, truncated), 0 (5-6), 10 (7-, cut)
-    # The order of starts is 10, 20 | t = 3: 0 ...
-    # so slot 0 takes 0 at t = 3 (3-4), both slots end at t = 4 and take 10 and 20 in slot order.
+    #   slot 0  10 10 10  0  0 10 10 10
+    #   slot 1  20 20 20 20 20 20 20 20
+    # Slot 0 takes 0 at t = 3 (3-4); both slots end at t = 4 and take 10 and 20 in slot order; 20 runs on.
     shard = by_hand([2.0, 3.0, 9.0], start=1, length=8)
     episodes = shard.episodes
-    assert episodes.ids.tolist() == [10, 20, 0, 10, 20]
-    assert episodes.slots.tolist() == [0, 1, 0, 0, 1]
-    assert episodes.starts.tolist() == [0, 0, 3, 5, 5]
-    assert episodes.lengths.tolist() == [3, 5, 2, 3, 3]
-    assert episodes.ends.tolist() == [TERMINATED, TRUNCATED, TERMINATED, TERMINATED, CUT]
-    assert episodes.returns.tolist() == [6.0, 15.0, 3.0, 6.0, 6.0]
-    # 1 + 2/2 + 3/4 = 2.75; ... + 4/8 + 5/16 = 3.5625; 1 + 2/2 = 2
-    assert episodes.discounted_returns.tolist() == [2.75, 3.5625, 2.0, 2.75, 2.75]
+    assert episodes.ids.tolist() == [10, 0, 20, 10]
+    assert episodes.contexts.tolist() == [[3.0], [2.0], [9.0], [3.0]]
+    assert episodes.slots.tolist() == [0, 0, 1, 0]
+    assert episodes.times.tolist() == [2, 4, 4, 7]
+    assert episodes.lengths.tolist() == [3, 2, 5, 3]
+    assert episodes.returns.tolist() == [6.0, 3.0, 15.0, 6.0]
+    # 1 + 2/2 + 3/4 = 2.75; 1 + 2/2 = 2; ... + 4/8 + 5/16 = 3.5625
+    assert episodes.discounted_returns.tolist() == [2.75, 2.0, 3.5625, 2.75]
     assert np.isnan(episodes.success).all()
+    assert shard.begun == 5
+    assert shard.starts.all()
+    assert [shard.terminated[4, 0], shard.truncated[4, 1], shard.terminated[7, 0]] == [True] * 3
+    left = shard.unfinished
+    assert (left.ids.tolist(), left.contexts.tolist(), left.lengths.tolist()) == ([0, 20], [[0.0], [9.0]], [0, 3])
+    assert (left.returns.tolist(), left.discounted_returns.tolist(), left.discounts.tolist()) == (
+        [0.0, 6.0], [0.0, 2.75], [0.0, 0.125]
+    )  # fmt: skip
+    assert left.seeds.tolist() == [0, int(episode_seeds(1, Purpose.EPISODES, 0, 0, count=16)[4])]
+    np.testing.assert_array_equal(left.actions[:, 1], np.clip(shard.actions[5:, 1], -1.0, 1.0))
+    assert not left.actions[:, 0].any()
     assert shard.observations[:, 0].tolist() == [[3, 0], [3, 1], [3, 2], [2, 0], [2, 1], [3, 0], [3, 1], [3, 2]]
     assert shard.observations[:, 1].tolist() == [[9, 0], [9, 1], [9, 2], [9, 3], [9, 4], [9, 0], [9, 1], [9, 2]]
     assert shard.last_observations.tolist() == [[3, 3], [9, 3]]
@@ -275,18 +283,20 @@ def test_the_walk_by_hand() -> None:
 
 def test_slots_that_end_together_take_the_next_instances_in_slot_order() -> None:
     # Lives 1, 2, 2, 5: slots 0-2 start with 0, 10, 20; slot 0 takes 30 at t = 1; slots 1 and 2 take 0 and 10 at t = 2.
-    episodes = by_hand([1.0, 2.0, 2.0, 5.0], start=0, length=4, slots=3).episodes
-    #                              t = 0  |  1 |  2    |  3: slot 1 (0 lived one step) takes 20
-    assert episodes.ids.tolist() == [0, 10, 20, 30, 0, 10, 20]
-    assert episodes.slots.tolist() == [0, 1, 2, 0, 1, 2, 1]
-    assert episodes.starts.tolist() == [0, 0, 0, 1, 2, 2, 3]
-    assert episodes.ends.tolist() == [TERMINATED, TERMINATED, TERMINATED, CUT, TERMINATED, TERMINATED, CUT]
+    shard = by_hand([1.0, 2.0, 2.0, 5.0], start=0, length=4, slots=3)
+    episodes = shard.episodes
+    assert shard.unfinished.ids.tolist() == [30, 20, 0]
+    # Slot 1 (0 lived one step) takes 20 at t = 3, which runs on, as 30 does.
+    assert episodes.ids.tolist() == [0, 10, 20, 0, 10]
+    assert episodes.slots.tolist() == [0, 1, 2, 1, 2]
+    assert episodes.times.tolist() == [0, 1, 1, 2, 3]
 
 
-def test_an_end_at_the_last_step_is_no_cut() -> None:
+def test_what_ends_at_the_last_step_is_not_unfinished() -> None:
     # Both live exactly to the round's last step: one by itself (a terminated step is never truncated too), one not.
     shard = by_hand([5.0, 9.0], start=0, length=5)
-    assert shard.episodes.ends.tolist() == [TERMINATED, TRUNCATED]
+    assert (shard.episodes.lengths.tolist(), shard.unfinished.lengths.tolist()) == ([5, 5], [0, 0])
+    assert shard.unfinished.actions.shape == (0, 2, 1)
     assert not (shard.terminated & shard.truncated).any()
     assert shard.truncated_observations.tolist() == [[9, 5]]
 
@@ -303,7 +313,8 @@ def test_a_shards_table_tells_what_its_arrays_hold() -> None:
     env = make_batched(POINTMASS, slots, context_visible=True)
     contexts = uniform(7)
     selection = dataclasses.replace(select(contexts, version=3), order_version=2)
-    (shard,) = collect(env, [Rollout(falling(version=5), selection, 4, gamma, seed=2, round=5, shard=1)], length=length)
+    rollout = Rollout(falling(version=5), selection, 4, gamma, seed=2, round=5, shard=1)
+    (shard,) = collect(Stage(env), [rollout], length=length)
     assert (shard.shard, shard.round, shard.policy_version, shard.selection_version, shard.order_version) == (
         1, 5, 5, 3, 2
     )  # fmt: skip
@@ -315,39 +326,39 @@ def test_a_shards_table_tells_what_its_arrays_hold() -> None:
     assert not (shard.terminated & shard.truncated).any()
 
     ended = shard.terminated | shard.truncated
-    found = []
+    begun, found = [], []
     for slot in range(slots):
         begin = 0
         for time in range(length):
             if ended[time, slot] or time == length - 1:
-                end = TERMINATED if shard.terminated[time, slot] else TRUNCATED if shard.truncated[time, slot] else CUT
-                found.append((begin, slot, time + 1 - begin, end))
+                begun.append((begin, slot))
+                if ended[time, slot]:
+                    found.append((time, slot, begin))
                 begin = time + 1
-    found.sort()  # episodes start in the order of time, and of slots within a step
+    begun.sort()  # episodes begin in the order of time, and of slots within a step
+    found.sort()  # and are told as they end
     episodes = shard.episodes
-    rows = zip(episodes.starts, episodes.slots, episodes.lengths, episodes.ends, strict=True)
-    assert [tuple(map(int, row)) for row in rows] == found
-    assert {end for *_, end in found} == {TERMINATED, TRUNCATED, CUT}
-    assert len(episodes) == len(found) == ended.sum() + (~ended[-1]).sum()
-    assert (episodes.ends == CUT).sum() == (~ended[-1]).sum()
-    assert episodes.lengths.sum() == length * slots
+    assert list(zip(episodes.times, episodes.slots, strict=True)) == [one[:2] for one in found]
+    assert episodes.lengths.tolist() == [time + 1 - begin for time, _, begin in found]
+    assert shard.begun == len(begun) == len(episodes) + (~ended[-1]).sum()
+    assert episodes.lengths.sum() + shard.unfinished.lengths.sum() == length * slots
     assert episodes.lengths.max() == 100
+    assert shard.terminated.any()
+    assert shard.truncated.any()
 
-    order = (4 + np.arange(len(found))) % 7
-    np.testing.assert_array_equal(episodes.ids, selection.ids[order])
+    order = {one: (4 + place) % 7 for place, one in enumerate(begun)}
     scaled = 2.0 * (contexts - LOW) / (HIGH - LOW) - 1.0
-    for row, (begin, slot, steps, end) in enumerate(found):
-        mine = slice(begin, begin + steps), slot
+    for row, (time, slot, begin) in enumerate(found):
+        mine, steps, place = (slice(begin, time + 1), slot), time + 1 - begin, order[begin, slot]
+        assert episodes.ids[row] == selection.ids[place]
+        np.testing.assert_array_equal(episodes.contexts[row], contexts[place])
         rewards = shard.rewards[mine]
         assert episodes.returns[row] == pytest.approx(rewards.sum(), rel=1e-12)
         assert episodes.discounted_returns[row] == pytest.approx((gamma ** np.arange(steps) * rewards).sum(), rel=1e-12)
         np.testing.assert_array_equal(shard.observations[begin, slot, :4], [0, 0, 3, 0])  # a fresh reset
-        np.testing.assert_allclose(shard.observations[mine][:, 4:], np.tile(scaled[order[row]], (steps, 1)), rtol=1e-6)
-        behind = shard.last_observations[slot] if begin + steps == length else None
-        if end == TRUNCATED:
-            at = np.argwhere(shard.truncated).tolist().index([begin + steps - 1, slot])
-            behind = shard.truncated_observations[at]
-        if behind is not None and end != TERMINATED:  # rewards are those of where the step led
+        np.testing.assert_allclose(shard.observations[mine][:, 4:], np.tile(scaled[place], (steps, 1)), rtol=1e-6)
+        if shard.truncated[time, slot]:  # rewards are those of where the step led
+            behind = shard.truncated_observations[np.argwhere(shard.truncated).tolist().index([time, slot])]
             distance = np.hypot(behind[0], behind[2] + 3.0)
             assert rewards[-1] == pytest.approx(np.exp(-0.6 * distance), rel=1e-5)
             assert episodes.success[row] == (distance < 0.25)
@@ -358,14 +369,15 @@ def test_a_shard_replays_by_hand_from_its_seeds() -> None:
     length, slots, seed = 110, 3, 6
     env = make_batched(POINTMASS, slots, context_visible=True)
     weights, selection = falling(version=2), select(uniform(4))
-    (told,) = collect(env, [Rollout(weights, selection, 0, 0.9, seed=seed, round=2, shard=1)], length=length)
+    (told,) = collect(Stage(env), [Rollout(weights, selection, 0, 0.9, seed=seed, round=2, shard=1)], length=length)
     seeds = episode_seeds(seed, Purpose.EPISODES, 2, 1, count=slots * length)
     single = ContextObservation(gym.make(POINTMASS))
-    for row in range(len(told.episodes)):
-        begin, slot = told.episodes.starts[row], told.episodes.slots[row]
-        context = selection.contexts[row % 4]
-        observation, _ = single.reset(seed=int(seeds[row]), options={"context": context})
-        for time in range(begin, begin + told.episodes.lengths[row]):
+    starts = np.concatenate([told.starts[None], (told.terminated | told.truncated)[:-1]])
+    for row, (begin, slot) in enumerate(np.argwhere(starts)):
+        observation, _ = single.reset(seed=int(seeds[row]), options={"context": selection.contexts[row % 4]})
+        for time in range(begin, length):
+            if time > begin and starts[time, slot]:
+                break
             np.testing.assert_array_equal(told.observations[time, slot], observation)
             observation, reward, *_ = single.step(np.clip(told.actions[time, slot], -10.0, 10.0))
             assert told.rewards[time, slot] == reward
@@ -399,8 +411,7 @@ def test_a_shard_is_a_pure_function_of_what_was_asked() -> None:
 )
 def test_another_round_shard_or_seed_gives_other_noise(other: Callable[[], Shard]) -> None:
     first, second = falls(Worker(setup_for())), other()
-    np.testing.assert_array_equal(second.episodes.ids[:4], first.episodes.ids[:4])
-    same_start = first.observations[0] == second.observations[0]
+    same_start = first.observations[0] == second.observations[0]  # and so the same instances
     assert same_start.all()
     assert not (first.actions[0] == second.actions[0]).any()
     assert not (first.observations[1, :, 0] == second.observations[1, :, 0]).any()
@@ -417,7 +428,8 @@ def test_where_shards_walk() -> None:
     new_order = dataclasses.replace(selection, order_version=1)
     assert [going_on.position(new_order, shard, 3) for shard in range(3)] == [0, 2, 4]
     shard = falls(Worker(setup_for()), shard=2, start=Walk(0, (0, 0, 3)))
-    assert shard.episodes.ids[:4].tolist() == [103, 104, 105, 100]
+    scaled = 2.0 * (selection.contexts[[3, 4, 5, 0]] - LOW) / (HIGH - LOW) - 1.0
+    np.testing.assert_allclose(shard.observations[0, :, 4:], scaled, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("selection_version", "weights_version"), [(3, 0), (5, 0), (4, 1)])
@@ -586,10 +598,12 @@ def test_a_shard_is_the_same_whoever_is_collected_beside_it(env_id: str, normali
             Rollout(policy, selection, seed, 0.9 + seed / 100, seed=seed, round=policy.version, shard=seed % 2)
         )
     length = make_batched(env_id, 1, context_visible=True).horizon + 7
-    alone = [collect(make_batched(env_id, slots, context_visible=True), [one], length=length)[0] for one in rollouts]
+    alone = [
+        collect(Stage(make_batched(env_id, slots, context_visible=True)), [one], length=length)[0] for one in rollouts
+    ]
     for chosen in ([0, 1, 2, 3, 4], [4, 2], [3, 0, 1]):
         env = make_batched(env_id, slots * len(chosen), context_visible=True)
-        together = collect(env, [rollouts[index] for index in chosen], length=length)
+        together = collect(Stage(env), [rollouts[index] for index in chosen], length=length)
         assert all(same(shard, alone[index]) for shard, index in zip(together, chosen, strict=True))
     assert not same(alone[0].episodes, alone[1].episodes)
 
@@ -623,4 +637,4 @@ def test_only_equals_act_side_by_side() -> None:
     one, other = weights_for(size, 2), weights_for(size, 2, hidden=9)
     rollouts = [Rollout(policy, select(uniform(3)), 0, 0.9, seed=0, round=0, shard=0) for policy in (one, other)]
     with pytest.raises(TypeError, match="one shape"):
-        collect(env, rollouts, length=5)
+        collect(Stage(env), rollouts, length=5)

@@ -208,7 +208,7 @@ def feedback(state: ContextState, contexts: np.ndarray, values: Any = 1.0) -> Fe
     m = len(contexts)
     episodes = Episodes(
         indices=np.full(m, -1), contexts=contexts, returns=np.ones(m), discounted_returns=np.arange(m, dtype=float),
-        lengths=np.ones(m, dtype=np.int64), success=np.zeros(m), finished=np.arange(m) > 0,
+        lengths=np.ones(m, dtype=np.int64), success=np.zeros(m),
         start_values=np.broadcast_to(values, m).astype(float), advantages=np.full(m, np.nan),
     )  # fmt: skip
     return Feedback(state.version, np.zeros(4), np.ones(4), 1, episodes=episodes)
@@ -236,15 +236,25 @@ def test_the_distribution_moves_once_the_warm_up_is_over_and_alpha_follows_perfo
         told.append(numbers)
     assert [numbers["moved"] for numbers in told] == [False, False, True, True, True]
     assert [numbers["alpha"] for numbers in told[:2]] == [None, None]
-    assert told[0]["mean_discounted_return"] == 6.0  # of 1 .. 11: the first episode was cut
+    assert told[0]["mean_discounted_return"] == 5.5  # of 0 .. 11
     start = one.start()[0].distribution
     target = Gaussian.of(np.array([0.5, 1.5]), np.array([0.1, 0.1]))
-    assert told[2]["alpha"] == pytest.approx(6.0 / start.kl_to(target))
+    assert told[2]["alpha"] == pytest.approx(5.5 / start.kl_to(target))
     divergences = [numbers["kl_to_target"] for numbers in told]
     assert divergences[0] == divergences[1] > divergences[2] > divergences[3] > divergences[4]  # type: ignore[operator]
     assert (state.version, state.updates) == (5, 3)
     assert told[4]["mean_a"] == state.mean[0]
     assert told[4]["target_std_b"] == pytest.approx(0.1)
+
+
+def test_an_iteration_in_which_no_episode_ended_moves_nothing() -> None:
+    one = curriculum()
+    state, selection = one.start()
+    for _ in range(3):
+        state, _, numbers = one.step(state, feedback(state, selection.contexts[:0]))
+        assert (numbers["moved"], numbers["mean_discounted_return"], numbers["alpha"]) == (False, None, None)
+    assert np.array_equal(state.mean, one.start()[0].mean)
+    assert (state.version, state.updates) == (3, 0)
 
 
 def test_the_limit_holds_only_while_the_target_is_far() -> None:

@@ -81,7 +81,7 @@ def test_a_finished_run_is_mirrored_whole_and_once(uri: str, tmp_path: Path) -> 
     assert points["learner/loss"] == [(n * STEPS, times[2 * n - 1], 1.0 / n) for n in range(1, 5)]
     assert [value for _, _, value in points["curriculum/trained_size"]] == [1, 2, 4, 4]
     assert {value for _, _, value in points["curriculum/grew"]} == {1.0}
-    assert {name for name in points if "/" not in name} == {"episodes", "episodes_cut", "iteration", "round"}
+    assert {name for name in points if "/" not in name} == {"episodes", "iteration", "round"}
     assert not {"rollout/success", "curriculum/mean_value_after", "test/returns"} & set(points)
 
     again = sync([ledger])

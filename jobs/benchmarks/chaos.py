@@ -599,7 +599,7 @@ def _points(ledger: Ledger) -> Iterator[tuple[str, int, int, float]]:
         numbers = {f"{section}/{key}": value for section in ("train", "test", "rollout", "learner", "curriculum")
                    for key, value in row.get(section, {}).items()}  # fmt: skip
         if row["kind"] == "iteration":
-            numbers |= {key: row[key] for key in ("iteration", "round", "episodes", "episodes_cut", "gradient_steps")}
+            numbers |= {key: row[key] for key in ("iteration", "round", "episodes", "gradient_steps")}
         numbers["timing/steps_per_second"] = timing["steps_per_second"]
         for key, value in numbers.items():
             if isinstance(value, int | float):

@@ -19,8 +19,8 @@ from space_dist.cluster import Central, Evidence, InProcess
 from space_dist.curricula import SetState
 from space_dist.instances import sample
 from space_dist.place import private_ray
-from space_dist.rollout import Walk
 from space_dist.training import learner_of, make_setup
+from space_dist.walk import Walk
 
 ROOT = Path(__file__).resolve().parents[2]
 console = Console()

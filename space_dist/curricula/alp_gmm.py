@@ -83,10 +83,9 @@ class AlpGmm(Curriculum):
         contexts, returns = state.contexts, state.returns
         recent, means, covariances = state.recent, state.means, state.covariances
         count = state.episodes
-        finished = np.flatnonzero(episodes.finished)
-        new_contexts = self._to_cube(episodes.contexts[finished])
+        new_contexts = self._to_cube(episodes.contexts)
         fit_rows: FloatArray | None = None
-        for context, value in zip(new_contexts, episodes.returns[finished], strict=True):
+        for context, value in zip(new_contexts, episodes.returns, strict=True):
             progress = absolute_progress(context, float(value), contexts, returns)
             contexts = np.concatenate([contexts, context[None]])[-self._history :]
             returns = np.append(returns, value)[-self._history :]

@@ -30,7 +30,7 @@ class Selection:
     version: counts decisions; whatever was computed for another version is refused.
     order_version: the version at which ids last changed; while it stays, the walk goes on where it stopped.
     drawn: whether these are draws, at least one for each episode that a round can hold, instead of a set to be passed
-        over: an iteration is one round then, and what counts as trained on are the draws that became episodes.
+        over: an iteration is one round then, and what counts as trained on are the draws whose episodes ended.
     """
 
     version: int
@@ -42,12 +42,13 @@ class Selection:
 
 @dataclass(frozen=True)
 class Episodes:
-    """The m training episodes of one iteration, round after round, shard after shard.
+    """The m training episodes that ended in one iteration, round after round, shard after shard.
+
+    Whole ones: what of an episode was played in earlier iterations counts, too. m may be 0.
 
     indices: (m,) into the instance set, GENERATED for generated contexts.  contexts: (m, d) in environment units.
-    returns, discounted_returns: (m,) in reward units; of a cut episode, as far as it got.
+    returns, discounted_returns: (m,) in reward units.
     lengths: (m,) in steps.  success: (m,) 1 or 0, NaN where the environment knows no success.
-    finished: (m,) false where the end of a round cut the episode.
     start_values: (m,) V(s0, c) behind the iteration's updates, in reward units.
     advantages: (m,) mean |GAE| over the episode's steps, in reward units; NaN for learners without advantages.
     """
@@ -58,7 +59,6 @@ class Episodes:
     discounted_returns: FloatArray
     lengths: IntArray
     success: FloatArray
-    finished: BoolArray
     start_values: FloatArray
     advantages: FloatArray
 

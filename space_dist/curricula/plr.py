@@ -61,12 +61,15 @@ class LevelReplay(Drawn):
         trained = counts > 0
         scores = np.where(trained, sums / np.maximum(counts, 1), state.scores)
         last = np.where(trained, state.version, state.last)
-        chances = replay_chances(
-            scores, state.version - last, last >= 0, self._ties, self._temperature, self._staleness_share
-        )
+        seen = last >= 0
+        chances = uniform(n)
+        if seen.any():  # an iteration may be over before its first episode is
+            chances = replay_chances(
+                scores, state.version - last, seen, self._ties, self._temperature, self._staleness_share
+            )
         new = ReplayState(state.version + 1, chances, scores, last)
         numbers = self._numbers(feedback, chances)
-        numbers |= {"seen": int((last >= 0).sum()), "mean_score": float(scores[last >= 0].mean()),
+        numbers |= {"seen": int(seen.sum()), "mean_score": float(scores[seen].mean()) if seen.any() else None,
                     "largest_score": float(scores.max())}  # fmt: skip
         return new, self.selection(new), numbers
 

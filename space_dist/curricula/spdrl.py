@@ -104,10 +104,10 @@ class SelfPaced(Curriculum):
         if episodes is None:
             raise ValueError("SPDRL needs the iteration's episodes")
         old, updates = state.distribution, state.updates
-        performance = float(episodes.discounted_returns[episodes.finished].mean())
+        performance = float(episodes.discounted_returns.mean()) if len(episodes.indices) else None
         to_target = old.kl_to(self._target)
         moved, alpha = Step(old, False, 0), None
-        if state.version >= self._warm_up:
+        if state.version >= self._warm_up and performance is not None:  # nothing to go by where no episode ended
             updates += 1
             alpha = weight_of_target(updates, self._offset, self._zeta, performance, to_target)
             limit = self._least_std if to_target > self._least_std_until else None

@@ -34,9 +34,9 @@ class _Targets:
 class Ensemble:
     """State-value functions of one architecture that differ by their first weights.
 
-    After each round, every member is fitted to the lambda-returns of that round's episodes, bootstrapped from itself
-    as it was before. All members see the same minibatches. Their parameters lie stacked along a leading axis, so that
-    a step of all costs little more than one of one.
+    After each round, every member is fitted to the lambda-returns of that round's transitions, bootstrapped from itself
+    as it was before, also where an episode goes on behind the round. All members see the same minibatches. Their
+    parameters lie stacked along a leading axis, so that a step of all costs little more than one of one.
 
     Raises ConfigError where observations are not flat, or hold no context although some of it shall stay unseen.
     """

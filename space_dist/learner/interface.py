@@ -31,8 +31,8 @@ NOT_A_NUMBER = "a weight is not a number"
 class Update:
     """What one update reported: SB3's own training metrics, and how many optimiser steps the scored network took.
 
-    advantages: (m,) mean |GAE| of each of the round's episodes, shard after shard, in reward units; None for learners
-        without advantages.
+    advantages: (length, slots of all shards) |GAE| of each transition, in reward units; None for learners without
+        advantages.
     """
 
     metrics: dict[str, float]
@@ -58,7 +58,7 @@ class Learner(abc.ABC):
         total_steps: int,
     ) -> None:
         self._config, self._seed, self._total_steps = config, seed, total_steps
-        self._episode_advantages: NDArray[np.float64] | None = None  # of the last update
+        self._advantages: NDArray[np.float64] | None = None  # their sizes, in the last update
         self._acted: Mapping[str, NDArray[Any]] | None = None  # for the present one
         refuse_spaces(config, observation_space, action_space)
         self._normaliser = (
@@ -163,9 +163,7 @@ class Learner(abc.ABC):
             if isinstance(value, int | float | np.number) and np.isfinite(value)
         }
         recorded.clear()
-        return Update(
-            {**metrics, **self._more_metrics(metrics)}, self._gradient_steps() - before, self._episode_advantages
-        )
+        return Update({**metrics, **self._more_metrics(metrics)}, self._gradient_steps() - before, self._advantages)
 
     def _more_metrics(self, metrics: Mapping[str, float]) -> dict[str, float]:  # noqa: ARG002 - SAC's needs them
         return {"reward_std": self.statistics.reward_std} if self.statistics.reward_std != 1.0 else {}

@@ -52,13 +52,14 @@ class Normaliser:
     """As SB3's VecNormalize, except that its statistics stand still within a round.
 
     Observations: minus their mean, by their standard deviation. Rewards: by the standard deviation of the discounted
-    return, which starts anew with each episode.
+    return, which starts anew with each episode and goes on with it from round to round.
     """
 
     def __init__(self, observation_space: spaces.Space[Any], gamma: float, observations: bool, rewards: bool) -> None:
         self._gamma, self._observations, self._rewards = gamma, observations, rewards
         self._seen = _Moments.empty(*(observation_space.shape or ()))
         self._returns = _Moments.empty()
+        self._running: FloatArray = np.zeros(0)  # (slots of all shards,) discounted returns behind the last round
 
     @property
     def statistics(self) -> Statistics:
@@ -70,26 +71,36 @@ class Normaliser:
 
     def update(self, shards: Sequence[Shard]) -> None:
         """Take in a round, in shard order."""
+        running: list[FloatArray] = []
+        known = self._running
         for shard in shards:
             if self._observations and not isinstance(shard.observations, dict):
                 self._seen.merge(shard.observations.reshape(-1, shard.observations.shape[-1]).astype(np.float64))
             if self._rewards:
-                self._returns.merge(_discounted(shard, self._gamma))
+                slots = len(shard.starts)
+                before = known[:slots] if len(known) else np.zeros(slots)
+                sums, after = _discounted(shard, self._gamma, before)
+                self._returns.merge(sums)
+                known, running = known[slots:], [*running, after]
+        if running:
+            self._running = np.concatenate(running)
 
     def save(self) -> dict[str, NDArray[Any]]:
         """Arrays from which `load` restores everything."""
         moments = {"observations": self._seen, "returns": self._returns}
-        return {
+        arrays = {
             f"{name}_{part}": np.asarray(getattr(one, part))
             for name, one in moments.items()
             for part in ("count", "mean", "squares")
         }
+        return {**arrays, "running": self._running}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Restore what `save` gave."""
         for name, one in {"observations": self._seen, "returns": self._returns}.items():
             one.count = float(arrays[f"{name}_count"])
             one.mean, one.squares = arrays[f"{name}_mean"].copy(), arrays[f"{name}_squares"].copy()
+        self._running = arrays["running"].copy()
 
     def normalize_obs(self, observations: Observations) -> Observations:
         """What SB3's replay buffer calls when it samples; dictionaries come back as they are."""
@@ -101,12 +112,15 @@ class Normaliser:
         return (np.clip(scaled, -REWARD_CLIP, REWARD_CLIP) if self._rewards else scaled).astype(np.float32)
 
 
-def _discounted(shard: Shard, gamma: float) -> FloatArray:
-    """`(length * slots,)` sum of gamma^(t-k) r_k up to each step t of its episode."""
-    running = np.zeros(shard.rewards.shape[1])
+def _discounted(shard: Shard, gamma: float, before: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`(length * slots,)` sum of gamma^(t-k) r_k up to each step t of its episode; (slots,) the last where one goes on.
+
+    before: (slots,) what the last round ended with.
+    """
+    running = np.where(shard.starts, 0.0, before)
     sums = np.empty_like(shard.rewards)
     for time, rewards in enumerate(shard.rewards):
         running = running * gamma + rewards
         sums[time] = running
         running = np.where(shard.terminated[time] | shard.truncated[time], 0.0, running)
-    return sums.reshape(-1)
+    return sums.reshape(-1), running

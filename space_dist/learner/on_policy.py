@@ -30,12 +30,16 @@ _OURS = {
 
 @dataclass(frozen=True)
 class Joined:
-    """The slots of all shards side by side: (length, slots, ...) each. ended: whether an episode did, at this step."""
+    """The slots of all shards side by side: (length, slots, ...) each. ended: whether an episode did, at this step.
+
+    starts: (slots,) whether the first step began an episode.
+    """
 
     observations: Observations
     actions: NDArray[np.generic]
     rewards: NDArray[np.float32]
     ended: NDArray[np.bool_]
+    starts: NDArray[np.bool_]
 
 
 class OnPolicyLearner(Learner):
@@ -103,7 +107,7 @@ class OnPolicyLearner(Learner):
     def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
         with self._weights(self._acted):
             advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
-        self._episode_advantages = mean_sizes(shards, advantages) * self.statistics.reward_std
+        self._advantages = np.abs(advantages, dtype=np.float64) * self.statistics.reward_std
         self.model.num_timesteps = steps
         self.model._update_current_progress_remaining(steps, self._total_steps)
         self.model.train()
@@ -111,8 +115,8 @@ class OnPolicyLearner(Learner):
     def fill(self, shards: Sequence[Shard]) -> RolloutBuffer:
         """Fill SB3's rollout buffer: values and log-probabilities by its policy, returns and advantages by its buffer.
 
-        As in SB3's own collecting, the value behind a truncated step is added to its reward, and an episode still
-        running at the end is bootstrapped from the value of its last observation.
+        As in SB3's own collecting, the value behind a truncated step is added to its reward, and an episode that goes
+        on is bootstrapped from the value of its last observation.
         """
         policy, buffer, joined = self.model.policy, self.model.rollout_buffer, self.joined(shards)
         observations, actions, rewards, ended = joined.observations, joined.actions, joined.rewards, joined.ended
@@ -135,7 +139,7 @@ class OnPolicyLearner(Learner):
         put(buffer.observations, slice(None), observations)
         buffer.actions[:] = actions.reshape(buffer.actions.shape)
         buffer.rewards[:] = rewards
-        buffer.episode_starts[:] = np.concatenate([np.ones((1, n_slots), dtype=np.bool_), ended[:-1]])
+        buffer.episode_starts[:] = np.concatenate([joined.starts[None], ended[:-1]])
         buffer.values[:] = values.numpy().reshape(length, n_slots)
         buffer.log_probs[:] = log_probs.numpy().reshape(length, n_slots)
         buffer.pos, buffer.full = length, True
@@ -151,23 +155,10 @@ class OnPolicyLearner(Learner):
             np.concatenate([shard.actions for shard in shards], axis=1),
             self._normaliser.normalize_reward(rewards) if self._normaliser else rewards.astype(np.float32),
             np.concatenate([shard.terminated for shard in shards], axis=1) | truncated,
+            np.concatenate([shard.starts for shard in shards]),
         )
 
     def _values(self, observations: Observations) -> NDArray[np.float32]:
         scaled = self.statistics.scaled(observations)
         values: NDArray[np.float32] = self.model.policy.predict_values(tensors(scaled)).numpy()
         return values
-
-
-def mean_sizes(shards: Sequence[Shard], numbers: NDArray[np.float32]) -> NDArray[np.float64]:
-    """`(episodes,)` mean absolute value over each episode of (length, slots of all shards) numbers, shard by shard."""
-    sums = np.zeros((len(numbers) + 1, numbers.shape[1]))
-    np.cumsum(np.abs(numbers), axis=0, dtype=np.float64, out=sums[1:])
-    means, first = [], 0
-    for shard in shards:
-        episodes, slots = shard.episodes, shard.episodes.slots + first
-        ends = episodes.starts + episodes.lengths
-        with np.errstate(invalid="ignore"):  # of infinite rewards: the update says that training diverged
-            means.append((sums[ends, slots] - sums[episodes.starts, slots]) / episodes.lengths)
-        first += shard.rewards.shape[1]
-    return np.concatenate(means)

@@ -22,7 +22,7 @@ from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig
 from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
-from space_dist.learner.on_policy import Joined, OnPolicyLearner, mean_sizes
+from space_dist.learner.on_policy import Joined, OnPolicyLearner
 from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Shape, Stack, rounded_up
 from space_dist.learner.trust_region import TRPO, TRPOSettings
 from space_dist.rollout import Shard
@@ -130,8 +130,7 @@ class PopulationLearner(OnPolicyLearner):
             metrics["std"] = torch.exp(model.policy.log_std).mean().item()
         for name, metric in metrics.items():
             model.logger.record(f"train/{name}", metric)
-        sizes = mean_sizes(collected.shards, collected.advantages)
-        self._episode_advantages = sizes * self.statistics.reward_std
+        self._advantages = np.abs(collected.advantages, dtype=np.float64) * self.statistics.reward_std
         return self._learnt(collected.shards, before)
 
 
@@ -288,8 +287,8 @@ def _evaluated(
 ) -> tuple[list[_Round], Samples]:
     """What the members collected, with values, log-probabilities and advantages under the weights that acted.
 
-    As in `OnPolicyLearner.fill`: the value behind a truncated step is added to its reward, and an episode still running
-    at the end is bootstrapped from the value of its last observation.
+    As in `OnPolicyLearner.fill`: the value behind a truncated step is added to its reward, and an episode that goes on
+    is bootstrapped from the value of its last observation.
     """
     joined = [learner.joined(shards) for learner, shards in zip(members, rounds, strict=True)]
     config = members[0].settings

@@ -1,0 +1,134 @@
+"""Where a round goes on: in the selection's order, and in the episodes that the round before left unfinished."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from space_dist.curricula import Selection
+from space_dist.errors import SpaceDistError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """The episodes that run in a shard's slots between two rounds: all that it takes to play them again, and go on.
+
+    ids: (slots,) instance.  contexts: (slots, d) in environment units.  seeds: (slots,).
+    lengths: (slots,) steps so far; 0 where no episode runs, and then everything else of the slot is 0.
+    returns, discounted_returns: (slots,) sums of rewards so far.  discounts: (slots,) gamma^length.
+    actions: (lengths.max(), slots, ...) as the environment was given them. The last row is everybody's last step; rows
+        before an episode's first step are 0.
+    """
+
+    ids: IntArray
+    contexts: FloatArray
+    seeds: NDArray[np.uint64]
+    lengths: IntArray
+    returns: FloatArray
+    discounted_returns: FloatArray
+    discounts: FloatArray
+    actions: NDArray[np.generic]
+
+    def same(self, other: Unfinished | None) -> bool:
+        """Whether both are the same to the bit."""
+        return other is not None and all(
+            one.shape == two.shape and one.dtype == two.dtype and one.tobytes() == two.tobytes()
+            for one, two in zip(vars(self).values(), vars(other).values(), strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Where each shard goes on. Its place in the order is void once the order has changed; its episodes go on.
+
+    positions: (shards,) of the next episode's instance in the selection's order.
+    unfinished: (shards,) what runs in each; None: nothing.  Empty: nothing runs anywhere.
+    """
+
+    order_version: int
+    positions: tuple[int, ...]
+    unfinished: tuple[Unfinished | None, ...] = ()
+
+    def position(self, selection: Selection, shard: int, n_shards: int) -> int:
+        """The place in `selection` of a shard's next episode: `n_shards` shards start spread over a new order."""
+        if selection.order_version == self.order_version:
+            return self.positions[shard] % len(selection.ids)
+        return shard % n_shards * len(selection.ids) // n_shards
+
+    def running(self, shard: int) -> Unfinished | None:
+        """The episodes that run in a shard's slots."""
+        return self.unfinished[shard] if self.unfinished else None
+
+    def of(self, shard: int) -> Walk:
+        """The same, without what runs in other shards: what is sent to whoever collects this one."""
+        mine = (one if number == shard else None for number, one in enumerate(self.unfinished))
+        return dataclasses.replace(self, unfinished=tuple(mine))
+
+    def after(
+        self, selection: Selection, begun: Sequence[int], unfinished: Sequence[Unfinished], *, n_shards: int
+    ) -> Walk:  # fmt: skip
+        """Where the next round goes on. begun: episodes that each shard began; n_shards: as in `position`."""
+        positions = tuple(
+            (self.position(selection, shard, n_shards) + count) % len(selection.ids)
+            for shard, count in enumerate(begun)
+        )
+        return Walk(selection.order_version, positions, tuple(unfinished))
+
+
+def stacked(walk: Walk) -> dict[str, NDArray[Any]]:
+    """All shards' unfinished episodes as arrays for a checkpoint: (shards, ...) each; none before the first round."""
+    unfinished = [one for one in walk.unfinished if one is not None]
+    if not unfinished:
+        return {}
+    length = max(len(one.actions) for one in unfinished)
+
+    def padded(actions: NDArray[np.generic]) -> NDArray[np.generic]:
+        return np.concatenate([np.zeros((length - len(actions), *actions.shape[1:]), actions.dtype), actions])
+
+    names = [field.name for field in dataclasses.fields(Unfinished) if field.name != "actions"]
+    arrays = {name: np.stack([getattr(one, name) for one in unfinished]) for name in names}
+    return {**arrays, "actions": np.stack([padded(one.actions) for one in unfinished])}
+
+
+def unstacked(
+    arrays: Mapping[str, NDArray[Any]], *, shards: int, slots: int, features: int, horizon: int,
+    action_shape: tuple[int, ...],
+) -> tuple[Unfinished, ...]:  # fmt: skip
+    """The inverse of `stacked`. Raises SpaceDistError for anything that cannot be a run's of these numbers."""
+    each = (shards, slots)
+    shapes = {
+        "ids": ("int64", each), "contexts": ("float64", (*each, features)), "seeds": ("uint64", each),
+        "lengths": ("int64", each), "returns": ("float64", each), "discounted_returns": ("float64", each),
+        "discounts": ("float64", each),
+    }  # fmt: skip
+    fit = arrays.keys() == {*shapes, "actions"} and all(
+        (arrays[name].dtype.name, arrays[name].shape) == expected for name, expected in shapes.items()
+    )
+    if fit:
+        lengths, actions = arrays["lengths"], arrays["actions"]
+        fit = (
+            bool(((lengths >= 0) & (lengths < horizon)).all())
+            and actions.dtype.kind in "if"
+            and actions.shape == (shards, lengths.max(), slots, *action_shape)
+        )
+    if not fit:
+        raise SpaceDistError(
+            "the checkpoint's episodes in progress are not those of a run with this config: it was written by another "
+            "version of space_dist, or the environment has changed. Use another folder"
+        )
+    longest = lengths.max(axis=1)
+    return tuple(
+        Unfinished(
+            **{name: arrays[name][shard] for name in shapes},
+            actions=actions[shard, actions.shape[1] - longest[shard] :],
+        )
+        for shard in range(shards)
+    )
