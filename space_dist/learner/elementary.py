@@ -25,9 +25,9 @@ _REPLACED: dict[str, np.ufunc] = {
 _KNOWN_TO_NUMPY = (torch.float32, torch.float64, torch.complex64, torch.complex128)
 
 
-def _replace() -> torch.library.Library:
+def _replace() -> object:
     """Give torch's dispatcher other kernels for tensors on the CPU; derivatives are torch's own, as before."""
-    library = torch.library.Library("aten", "IMPL")
+    library: Any = torch.library.Library("aten", "IMPL")  # type: ignore[no-untyped-call]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # torch warns of every kernel that is replaced
         for name, function in _REPLACED.items():
@@ -95,7 +95,7 @@ def _update(inputs: torch.Tensor) -> Iterator[tuple[str, NDArray[Any]]]:
     convolution = torch.nn.Conv2d(1, 4, 3, stride=2)
     optimizer = torch.optim.Adam([*network.parameters(), *convolution.parameters()], lr=1e-2)
     loss = network(inputs).pow(2).mean() + torch.relu(convolution(inputs[None, None])).mean()
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     optimizer.step()
     for parameter in (*network.parameters(), *convolution.parameters()):
         yield "updated", parameter.detach().numpy()
