@@ -5,13 +5,25 @@ from __future__ import annotations
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
 import typer
-from benchmarks import chaos, checkpoint, coverage, curricula, curriculum, envs, equivalence, grid, throughput
+from benchmarks import (
+    arithmetic,
+    chaos,
+    checkpoint,
+    coverage,
+    curricula,
+    curriculum,
+    envs,
+    equivalence,
+    grid,
+    throughput,
+)
 from rich.console import Console
 
 from space_dist.errors import SpaceDistError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 for _benchmark in (
+    arithmetic.arithmetic,
     chaos.chaos,
     checkpoint.checkpoint,
     coverage.coverage,

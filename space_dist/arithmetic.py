@@ -80,14 +80,18 @@ def has_reference_cpu() -> bool:
     return set(flags) >= _NEEDED
 
 
+def overruled() -> list[str]:
+    """A sentence for each setting of the user's that gave way to ours in this process."""
+    return [
+        f"{name}={given} of the environment is overruled by {name}={SETTINGS[name]}: results are the same on every CPU"
+        for name, given in sorted(_overruled.items())
+    ]
+
+
 def remarks(found: str) -> list[str]:
     """Sentences about this process's arithmetic, whose `digest` of everything is `found`: for the log of a run."""
-    said = [
-        f"{name}={given} of the environment was overruled by {name}={SETTINGS[name]}: results must be the same on "
-        "every CPU" for name, given in sorted(_overruled.items())
-    ]  # fmt: skip
     if found == REFERENCE["all"]:
-        return said
+        return overruled()
     if not has_reference_cpu():
         reason = f"this is no x86-64 CPU with AVX2 and FMA ({platform.machine()})"
     elif _late:
@@ -95,7 +99,7 @@ def remarks(found: str) -> list[str]:
     else:
         reason = "the libraries, or the system's libm, are other versions than those of constraints.txt and Debian 12"
     return [
-        *said,
+        *overruled(),
         f"this process's arithmetic ({found}) is not the reference ({REFERENCE['all']}): {reason}. Results are valid "
         "and repeatable where arithmetic is this, but are not the bits of other machines; the run says so in its "
         "fingerprint",

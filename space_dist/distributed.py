@@ -36,6 +36,7 @@ from ray.util.placement_group import PlacementGroup, placement_group, placement_
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
+from space_dist.arithmetic import SETTINGS, has_reference_cpu, numpy_digest
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
@@ -60,9 +61,9 @@ log = logging.getLogger("space_dist")
 class _Timed:
     """An actor's side of a call: what it answers, and how long that took."""
 
-    def ready(self) -> bool:
-        """Answers once the actor is up."""
-        return True
+    def ready(self) -> str:
+        """Answers once the actor is up: with what its arithmetic computes."""
+        return numpy_digest()
 
     def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
         """Seconds, and the answer: one object, or each of `several`."""
@@ -363,6 +364,8 @@ class RayCluster:
             # Never restarted by Ray: an actor that came back blank would go on silently.
             inside = PlacementGroupSchedulingStrategy(self._room, placement_group_bundle_index=-1)
             options: dict[str, Any] = {"max_restarts": 0, "scheduling_strategy": inside}
+            if self._resources.address != "local" and has_reference_cpu():  # our own Ray's processes inherit them
+                options["runtime_env"] = {"env_vars": SETTINGS}
             setup = self._setup_piece.ref
             self._actors[seat] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup)
@@ -386,10 +389,11 @@ class RayCluster:
         for seat, (ref, since) in list(self._starting.items()):
             if ref in arrived:
                 try:
-                    ray.get(ref)
+                    found = ray.get(ref)
                 except RayError as error:
                     self._retry_start(seat, error)
                 else:
+                    _refuse_other_arithmetic(seat, found)
                     del self._starting[seat]
                     self._failed_starts[seat] = 0
             elif time.monotonic() - since > self._resources.first_answer_seconds:
@@ -543,6 +547,16 @@ def remove_session(folder: str | None) -> None:
     """Remove what a Ray of our own has left of its sockets and logs: Ray itself never does."""
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _refuse_other_arithmetic(seat: int, found: str) -> None:
+    """Raise SpaceDistError for an actor whose results would depend on its being there."""
+    if found != numpy_digest():
+        raise SpaceDistError(
+            f"{_name(seat)} computes other bits ({found}) than this process ({numpy_digest()}): its node has another "
+            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
+            "nodes of one kind (resources.address, or the cluster's own constraints)"
+        )
 
 
 def _name(seat: int) -> str:

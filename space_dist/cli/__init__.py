@@ -9,6 +9,7 @@ import sys
 
 import typer
 
+from space_dist.arithmetic import overruled
 from space_dist.cli import runs
 from space_dist.cli.grids import grid_app
 from space_dist.cli.inputs import config_app, instances_app
@@ -33,6 +34,8 @@ app.add_typer(env_app, name="env")
 def main() -> None:
     """Run a command; every error that a user can cause ends it with one sentence and its exit code."""
     keep_outputs()
+    for sentence in overruled():
+        warn(f"space-dist: {sentence}")
     look_here_too()  # import paths in configs may name the user's own modules
     try:
         app()

@@ -1,0 +1,102 @@
+"""One arithmetic: settings before libraries, exact square roots, and a fingerprint of what is computed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from space_dist import arithmetic
+from space_dist.arithmetic import REFERENCE, SETTINGS, digest, numpy_digest, remarks, settle
+from space_dist.learner import torch_probes
+
+pytestmark = pytest.mark.skipif(not arithmetic.has_reference_cpu(), reason="settings are for x86-64 with AVX2 and FMA")
+
+
+def fresh(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A new interpreter that inherits none of our settings."""
+    inherited = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=inherited | environment, capture_output=True, text=True, check=True
+    )  # fmt: skip
+
+
+def test_importing_us_settles_this_process_and_its_children() -> None:
+    said = fresh(f"import space_dist, os; print({{name: os.environ[name] for name in {list(SETTINGS)}}} == "
+                 "space_dist.arithmetic.SETTINGS)")  # fmt: skip
+    assert (said.stdout, said.stderr) == ("True\n", "")
+
+
+@pytest.mark.parametrize("given", ["AVX2", "AUTO", "COMPATIBLE"])
+def test_ours_wins_over_the_users_and_says_so(given: str) -> None:
+    said = fresh("import sys; sys.argv[1:] = ['--help']; from space_dist.cli import main; main()", MKL_CBWR=given).stderr
+    assert said == (
+        "" if given == "COMPATIBLE" else
+        f"space-dist: MKL_CBWR={given} of the environment is overruled by MKL_CBWR=COMPATIBLE: results are the same on "
+        "every CPU\n"
+    )  # fmt: skip
+
+
+def test_a_numpy_that_was_there_before_is_noticed() -> None:
+    early = fresh("import numpy; import space_dist", OPENBLAS_CORETYPE="Prescott").stderr
+    assert "numpy had been imported before space_dist, too late for the settings" in early
+    assert fresh("import space_dist; import numpy").stderr == ""
+
+
+def test_another_kind_of_cpu_is_left_alone_and_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arithmetic, "has_reference_cpu", lambda: False)
+    monkeypatch.setenv("MKL_CBWR", "AUTO")
+    settle()
+    assert os.environ["MKL_CBWR"] == "AUTO"
+    (said,) = remarks("0123456789abcdef")
+    assert "is not the reference" in said
+    assert "no x86-64 CPU with AVX2 and FMA" in said
+
+
+def test_the_reference_needs_no_words_and_anything_else_does() -> None:
+    assert remarks(REFERENCE["all"]) == []
+    (said,) = remarks("0123456789abcdef")
+    assert "other versions than those of constraints.txt" in said
+
+
+def test_the_digest_is_of_bits() -> None:
+    values = np.linspace(0.0, 1.0, 7)
+    moved = values.copy()
+    moved[3] = np.nextafter(moved[3], 1.0)
+    assert digest([("a", values)]) != digest([("a", moved)])
+    assert digest([("a", values)]) != digest([("b", values)])
+    assert numpy_digest() == digest(arithmetic.numpy_probes())
+    assert digest(torch_probes()) == digest(torch_probes())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_square_roots_are_exactly_rounded(dtype: torch.dtype) -> None:
+    """MKL's are not, and not equal on Intel's and AMD's CPUs; Adam takes one of every weight's second moment."""
+    values = torch.from_numpy(np.random.default_rng(0).random(5000) * 100).to(dtype)
+    exact = np.sqrt(values.numpy())
+    into, here = torch.empty(0, dtype=dtype), values.clone()
+    torch.sqrt(values, out=into)
+    here.sqrt_()
+    strided = values.reshape(50, 100).t().sqrt().t().reshape(-1)
+    for found in (values.sqrt(), into, here, strided, torch._foreach_sqrt([values])[0]):
+        np.testing.assert_array_equal(found.numpy(), exact)
+    with torch.inference_mode():
+        np.testing.assert_array_equal(values.sqrt().numpy(), exact)
+
+
+def test_what_is_replaced_still_has_derivatives_and_takes_every_kind() -> None:
+    values = torch.tensor([0.25, 0.5], requires_grad=True)
+    for function, derivative in (
+        (torch.sqrt, lambda x: 0.5 / x**0.5), (torch.atan, lambda x: 1 / (1 + x**2)),
+        (torch.asin, lambda x: (1 - x**2) ** -0.5), (torch.tan, lambda x: 1 / torch.cos(x) ** 2),
+    ):  # fmt: skip
+        (gradient,) = torch.autograd.grad(function(values).sum(), values)
+        torch.testing.assert_close(gradient, derivative(values.detach()))
+    assert torch.sqrt(torch.tensor([4, 9])).tolist() == [2.0, 3.0]
+    assert torch.sqrt(torch.tensor(4.0)).shape == ()
+    assert torch.sqrt(torch.tensor([4.0], dtype=torch.bfloat16)).dtype == torch.bfloat16
+    assert torch.isnan(torch.sqrt(torch.tensor(-1.0)))
