@@ -371,7 +371,9 @@ def test_absolute_learning_progress_by_hand() -> None:
     contexts = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5], [0.2, 0.0], [0.9, 0.1], [0.0, 1.0]])
     returns = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     assert absolute_progress(np.array([0.45, 0.5]), 10.0, contexts, returns) == 7.0
-    assert absolute_progress(np.array([0.1, 0.0]), 0.0, contexts, returns) == 1.0  # as near as the fourth, and older
+    assert absolute_progress(np.array([0.1, 0.0]), 0.0, contexts, returns) == 4.0  # as near as the first, and newer
+    played = np.concatenate([contexts, contexts[:1]])
+    assert absolute_progress(contexts[0], 9.0, played, np.append(returns, 7.5)) == 1.5  # the last time it was played
     assert absolute_progress(np.array([0.45, 0.5]), 10.0, contexts[:5], returns[:5]) == 0.0  # five are too few
 
 
@@ -447,9 +449,9 @@ def test_the_first_fit_comes_after_fit_rate_finished_episodes(from_set: bool) ->
     state, _, numbers = one.step(state, told)
     assert (numbers["finished_episodes"], numbers["fitted"], len(state.means)) == (15, False, 0)
     # Two contexts in turn, the fourth episode unfinished; returns are 0, 1, 2, 4, 5, ... The seventh finished episode
-    # is the first that has more than five before it. Each is compared with the oldest of its context: return 0 or 1.
+    # is the first that has more than five before it. Each is compared with the newest of its context.
     assert state.returns.tolist() == [0.0, 1.0, 2.0, *range(4, 16)]
-    assert state.recent[:, -1].tolist() == [0.0] * 6 + [7.0 - 1.0, 8.0, 8.0, 10.0, 10.0, 12.0, 12.0, 14.0, 14.0]
+    assert state.recent[:, -1].tolist() == [0.0] * 6 + [7.0 - 5.0] + [2.0] * 8
     state, selection, numbers = one.step(state, dataclasses.replace(told, version=1))
     assert (numbers["finished_episodes"], numbers["fitted"]) == (30, True)
     assert len(state.means) >= 2

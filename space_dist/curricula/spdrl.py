@@ -11,8 +11,9 @@ instance sets of everyone. ../shared/reference/algorithm.md ("SPDRL") names what
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -42,6 +43,7 @@ _CG_STEPS = 10
 _LINE_SEARCH_STEPS, _SHRINK = 20, 0.8
 
 Optimiser = Literal["trust_constr", "conjugate_gradient"]
+Answer = TypeVar("Answer", float, FloatArray)
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,15 @@ class ContextState(State):
 
 
 class Step(NamedTuple):
-    """One move of the distribution, whether it was taken, and how many iterations the optimiser made."""
+    """One move of the distribution, whether it was taken, and how many iterations the optimiser made.
+
+    refused: how often it proposed a distribution whose densities or divergences are no numbers.
+    """
 
     distribution: Gaussian
     accepted: bool
     iterations: int
+    refused: int = 0
 
 
 class SelfPaced(Curriculum):
@@ -126,6 +132,7 @@ class SelfPaced(Curriculum):
             "kl_step": old.kl_to(moved.distribution),
             "moved": moved.accepted,
             "optimiser_iterations": moved.iterations,
+            "refused_proposals": moved.refused,
         }
         for which, one in (("", moved.distribution), ("target_", self._target)):
             for name, mean, std in zip(self._bounds.names, one.mean.tolist(), one.std.tolist(), strict=True):
@@ -188,9 +195,48 @@ class Objective:
         return np.exp(np.minimum(logs, _LARGEST_LOG_RATIO))
 
 
+class _Guarded:
+    """An objective that an optimiser may ask about anything.
+
+    A trial step may propose log standard deviations whose exponentials overflow, or vanish. Such a proposal is no
+    distribution: it counts as infinitely bad and infinitely far, so that it is refused and the search goes on from
+    where it was, with a smaller step.
+    """
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective, self.refused = objective, 0
+
+    def value(self, parameters: FloatArray) -> float:
+        return self._numbers(self._objective.value, parameters, -np.inf)
+
+    def step_size(self, parameters: FloatArray) -> float:
+        return self._numbers(self._objective.step_size, parameters, np.inf)
+
+    def gradient(self, parameters: FloatArray) -> FloatArray:
+        return self._numbers(self._objective.gradient, parameters, np.zeros(len(parameters)))
+
+    def step_size_gradient(self, parameters: FloatArray) -> FloatArray:
+        return self._numbers(self._objective.step_size_gradient, parameters, np.zeros(len(parameters)))
+
+    def _numbers(self, ask: Callable[[FloatArray], Answer], parameters: FloatArray, refusal: Answer) -> Answer:
+        try:
+            with np.errstate(all="ignore"):
+                answer = ask(parameters)
+        except (ValueError, np.linalg.LinAlgError):  # SciPy's, of a factor that is infinite, or singular
+            answer = refusal
+        if np.isfinite(answer).all():
+            return answer
+        self.refused += 1
+        return refusal
+
+
 def by_trust_region(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
-    """SciPy's trust-constr with analytic gradients. A failed search counts if it ends feasible and better."""
-    objective, start, low = _standardised(problem, least_std)
+    """SciPy's trust-constr with analytic gradients. A failed search counts if it ends feasible and better.
+
+    Where nothing is found that is a distribution, the old one stays.
+    """
+    standard, start, low = _standardised(problem, least_std)
+    objective = _Guarded(standard)
     # SciPy asks for a feasible start where bounds must not be left.
     start = start if low is None else np.maximum(start, low)
     trust = NonlinearConstraint(
@@ -203,11 +249,13 @@ def by_trust_region(problem: Objective, epsilon: float, least_std: FloatArray | 
         bounds=None if low is None else Bounds(low, np.inf, keep_feasible=True),
         options={"gtol": _GTOL, "xtol": _XTOL},
     )  # fmt: skip
-    usable = bool(np.isfinite(found.x).all())
-    better = usable and objective.step_size(found.x) <= epsilon and objective.value(found.x) >= objective.value(start)
+    refused = objective.refused
+    gain = objective.value(found.x) - objective.value(start)
+    usable = bool(np.isfinite(found.x).all() and np.isfinite(gain))
+    better = usable and objective.step_size(found.x) <= epsilon and gain >= 0.0
     if usable and (found.success or better):
-        return Step(Gaussian.from_parameters(found.x).back_from(problem.old), True, int(found.nit))
-    return Step(problem.old, False, int(found.nit))
+        return Step(Gaussian.from_parameters(found.x).back_from(problem.old), True, int(found.nit), refused)
+    return Step(problem.old, False, int(found.nit), refused)
 
 
 def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
@@ -215,8 +263,9 @@ def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatAr
 
     The standard deviations are clamped behind the step, so a clamped step may leave the trust region.
     """
-    objective, start, low = _standardised(problem, least_std)
-    fisher = objective.old.fisher()
+    standard, start, low = _standardised(problem, least_std)
+    objective = _Guarded(standard)
+    fisher = standard.old.fisher()
     direction, _ = cg(fisher, objective.gradient(start), maxiter=_CG_STEPS)
     length = float(direction @ fisher @ direction)
     if length > 0.0:
@@ -226,9 +275,10 @@ def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatAr
             moved = start + step
             if objective.step_size(moved) <= epsilon and objective.value(moved) > before:
                 moved = moved if low is None else np.maximum(moved, low)
-                return Step(Gaussian.from_parameters(moved).back_from(problem.old), True, tried)
+                new = Gaussian.from_parameters(moved).back_from(problem.old)
+                return Step(new, True, tried, objective.refused)
             step = _SHRINK * step
-    return Step(problem.old, False, _LINE_SEARCH_STEPS)
+    return Step(problem.old, False, _LINE_SEARCH_STEPS, objective.refused)
 
 
 def _standardised(problem: Objective, least_std: FloatArray | None) -> tuple[Objective, FloatArray, FloatArray | None]:
