@@ -125,7 +125,7 @@ class Central:
         members = checked(np.concatenate(seen["members"]), "values of the ensemble") if seen.get("members") else None
         feedback = Feedback(
             version, before, after, gradient_steps, members=members,
-            episodes=next(self._valued(seen, after), None), probes=self._probed(version, seen.get("probes", [])),
+            episodes=next(self._valued(seen, after), None), probes=self._probed(state, seen),
         )  # fmt: skip
         new, selection, numbers = self.curriculum.step(state, feedback)
         return new, selection, numbers, after
@@ -136,12 +136,13 @@ class Central:
             values = seen.get("context_values") or [after[episodes.indices]]
             yield dataclasses.replace(episodes, start_values=checked(np.concatenate(values), "start values"))
 
-    def _probed(self, version: int, parts: list[Outcomes]) -> Probes | None:
+    def _probed(self, state: State, seen: Mapping[str, list[Any]]) -> Probes | None:
+        parts: list[Outcomes] = seen.get("probes", [])
         if not parts:
             return None
-        indices = self.curriculum.probes(version)
+        indices = self.curriculum.probes(state, next(iter(seen.get("episodes", [])), None))
         if indices is None:
-            raise RuntimeError(f"selection {version} was probed, and nobody asked for that")
+            raise RuntimeError(f"selection {state.version} was probed, and nobody asked for that")
         outcomes = joined(parts)
         if np.isnan(outcomes.success).any():
             raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")

@@ -374,7 +374,10 @@ class Training:
         There are none where they, at their longest, would leave no room for another round.
         """
         run, cluster = self._run, self._cluster
-        indices = self._curriculum.probes(run.version)
+        if not self._config.curriculum.probes:
+            return []
+        (state,) = yield from self._settle([run.state])
+        indices = self._curriculum.probes(state, _joined_episodes(run.seen))
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
         outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))

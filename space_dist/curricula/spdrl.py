@@ -271,7 +271,9 @@ def by_trust_region(problem: Objective, epsilon: float, least_std: FloatArray | 
                 return Step(Gaussian.from_parameters(found.x).back_from(problem.old), True, int(found.nit), refused)
         return Step(problem.old, False, int(found.nit), refused)
     moved = not np.array_equal(search.best, start)
-    return Step(Gaussian.from_parameters(search.best).back_from(problem.old) if moved else problem.old, moved, 0, refused)
+    return Step(
+        Gaussian.from_parameters(search.best).back_from(problem.old) if moved else problem.old, moved, 0, refused
+    )
 
 
 def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
