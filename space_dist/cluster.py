@@ -120,7 +120,7 @@ class Central:
         arriving = iter(pieces)
         seen = {name: [next(arriving) for _ in range(count)] for name, count in layout.items()}
         after = checked(np.concatenate(seen["after"]), "start values")
-        if seen.get("rescored") and not (self._from_zero and version == 0):
+        if seen.get("rescored"):
             before = checked(np.concatenate(seen["rescored"]), "start values")
         members = checked(np.concatenate(seen["members"]), "values of the ensemble") if seen.get("members") else None
         feedback = Feedback(

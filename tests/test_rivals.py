@@ -315,11 +315,8 @@ def replayed_by_hand(
             weights = weights if any(weights) else [1.0] * len(ranked)
         else:
             weights = [(rank + 1) ** (-1.0 / beta) for rank in range(len(ranked))]
-        total = 0.0
-        for one, weight in zip(ranked, weights, strict=True):
-            total += weight / math.fsum(weights)
-            if point < total:
-                break
+        shares = itertools.accumulate(weight / math.fsum(weights) for weight in weights)
+        one = next(one for one, below in zip(ranked, shares, strict=True) if point < below)
         left.remove(one)
         last[one] = now
         played.append(one)

@@ -145,9 +145,9 @@ class AlpGmm(Curriculum):
 def absolute_progress(context: FloatArray, value: float, contexts: FloatArray, returns: FloatArray) -> float:
     """|value - the return of the nearest context of the history|; 0 while the history has no more than five.
 
-    context: (d,), contexts: (m, d), returns: (m,), oldest first. Of equally near ones the newest counts: in a finite set
-    that is the last time the instance was played. Portelas et al. 2019 have continuous contexts, where none are equal;
-    the kd-tree of their code returns whichever it meets first.
+    context: (d,), contexts: (m, d), returns: (m,), oldest first. Of equally near ones the newest counts: in a finite
+    set that is the last time the instance was played. Portelas et al. 2019 have continuous contexts, where none are
+    equal; the kd-tree of their code returns whichever it meets first.
     """
     if len(contexts) <= FEWEST_POINTS:
         return 0.0
