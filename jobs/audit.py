@@ -1,6 +1,6 @@
 """Make every decision of a run again, from its ledger alone: `python jobs/audit.py RUN`.
 
-Written from docs/algorithm.md, with NumPy and the standard library, and nothing of space_dist: whoever trusts neither
+Written from docs/algorithm.md, with NumPy, the standard library and a reader of YAML, and nothing of space_dist: whoever trusts neither
 its code nor its tests can read this file in five minutes. Start values come from values.jsonl, what was trained on from
 curriculum.jsonl, gradient steps and what the run said of itself from metrics.jsonl, settings from config.yaml.
 
@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
+from ruamel.yaml import YAML
 
 Values = NDArray[np.float64]
 Keys = NDArray[np.uint64]
@@ -80,12 +80,8 @@ def read(folder: Path) -> Run:
     for name in ("config.yaml", "instances_train.csv", "values.jsonl", "curriculum.jsonl", "metrics.jsonl"):
         if not (folder / name).is_file():
             raise NotAuditableError(f"{folder} has no {name}")
-    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config = YAML(typ="safe").load((folder / "config.yaml").read_text())
     settings = config["curriculum"]
-    for key in ("eta", "epsilon"):  # YAML 1.1 takes 1e-06 for text, and off for false
-        if key in settings:
-            settings[key] = float(settings[key])
-    settings["adaptive_eta"] = settings.get("adaptive_eta") or "off"
     with (folder / "instances_train.csv").open(newline="") as file:
         table = sorted(csv.DictReader(file), key=lambda row: int(row["id"]))
     scored = rows(folder / "values.jsonl")
@@ -162,13 +158,15 @@ def scores(run: Run, version: int, before: Values, after: Values, trained: NDArr
             found[~members] = -np.linalg.norm(scaled[~members, None] - scaled[members], axis=2).min(axis=1)
     else:
         change = after - before  # line 11
-        with np.errstate(over="ignore"):
-            found = {
-                "improvement": lambda: change,
-                "abs": lambda: np.abs(change),
-                "relative": lambda: change / np.maximum(np.abs(before), FLOOR),
-                "lowest_value": lambda: -after,
-            }[pic]()  # type: ignore[index]
+        if pic == "improvement":
+            found = change
+        elif pic == "abs":
+            found = np.abs(change)
+        elif pic == "relative":
+            with np.errstate(over="ignore"):
+                found = change / np.maximum(np.abs(before), FLOOR)
+        else:
+            found = -after  # lowest_value
     return -found if settings["reverse"] else found
 
 
