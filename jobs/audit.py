@@ -1,8 +1,8 @@
 """Make every decision of a run again, from its ledger alone: `python jobs/audit.py RUN`.
 
 Written from docs/algorithm.md, with NumPy, the standard library and a reader of YAML, and nothing of space_dist: whoever trusts neither
-its code nor its tests can read this file in five minutes. Start values come from values.jsonl, what was trained on from
-curriculum.jsonl, gradient steps and what the run said of itself from metrics.jsonl, settings from config.yaml.
+its code nor its tests can read this file in five minutes. Start values come from values.jsonl, what was trained on
+from curriculum.jsonl, gradient steps and what the run said of itself from metrics.jsonl, settings from config.yaml.
 
 Exit code 0: all decisions are as they should be. 1: the first that is not is printed. 2: this cannot be audited.
 """
@@ -140,12 +140,14 @@ def best(scores: Values, size: int, ties: Keys) -> NDArray[np.int64]:
 def scores(run: Run, version: int, before: Values, after: Values, trained: NDArray[np.int64]) -> Values:
     """Line 12: what the instances are ranked by, highest first, in the decision behind selection `version`."""
     settings = run.curriculum
+    found: Values
     kind, pic = settings["kind"], settings.get("pic")
     if kind == "random_growth" or pic == "random":
         return shifted(keys_of(run, RANDOM_GROWTH), version).astype(np.float64)
     if kind == "manual":
         column = run.columns[settings["column"]]
-        return column if settings["reverse"] else -column
+        found = column if settings["reverse"] else -column
+        return found
     if kind == "cspace":
         low, high = run.bounds
         scaled = 2.0 * (run.contexts - low) / (high - low) - 1.0
