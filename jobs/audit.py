@@ -1,8 +1,9 @@
 """Make every decision of a run again, from its ledger alone: `python jobs/audit.py RUN`.
 
-Written from docs/algorithm.md, with NumPy, the standard library and a reader of YAML, and nothing of space_dist: whoever trusts neither
-its code nor its tests can read this file in five minutes. Start values come from values.jsonl, what was trained on
-from curriculum.jsonl, gradient steps and what the run said of itself from metrics.jsonl, settings from config.yaml.
+Written from docs/algorithm.md, with NumPy, the standard library and a reader of YAML, and nothing of space_dist:
+whoever trusts neither its code nor its tests can read this file in five minutes. Start values come from values.jsonl,
+what was trained on from curriculum.jsonl, gradient steps and what the run said of itself from metrics.jsonl, settings
+from config.yaml.
 
 Exit code 0: all decisions are as they should be. 1: the first that is not is printed. 2: this cannot be audited.
 """
