@@ -85,8 +85,8 @@ class _Watched(InProcess):
 
 
 def pic(
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each way to rank.")] = 6,
-    steps: Annotated[int, typer.Option(min=10_240, help="Environment steps of a run.")] = 153_600,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each way to rank.")] = 3,
+    steps: Annotated[int, typer.Option(min=10_240, help="Environment steps of a run.")] = 102_400,
     processes: Annotated[int, typer.Option(min=1, help="Runs at a time. Decides no result.")] = 2,
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
 ) -> None:
