@@ -15,6 +15,7 @@ from benchmarks import (
     envs,
     equivalence,
     grid,
+    pic,
     throughput,
 )
 from rich.console import Console
@@ -32,6 +33,7 @@ for _benchmark in (
     envs.envs,
     equivalence.equivalence,
     grid.grid,
+    pic.pic,
     throughput.throughput,
 ):
     app.command()(_benchmark)

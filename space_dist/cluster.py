@@ -121,12 +121,12 @@ class Central:
         arriving = iter(pieces)
         seen = {name: [next(arriving) for _ in range(count)] for name, count in layout.items()}
         after = checked(np.concatenate(seen["after"]), "start values")
-        if seen.get("rescored") and not (self._from_zero and version == 0):
+        if seen.get("rescored"):
             before = checked(np.concatenate(seen["rescored"]), "start values")
         members = checked(np.concatenate(seen["members"]), "values of the ensemble") if seen.get("members") else None
         feedback = Feedback(
             version, before, after, gradient_steps, members=members,
-            episodes=next(self._valued(seen, after), None), probes=self._probed(version, seen.get("probes", [])),
+            episodes=next(self._valued(seen, after), None), probes=self._probed(state, seen),
         )  # fmt: skip
         new, selection, numbers = self.curriculum.step(state, feedback)
         return new, selection, numbers, after
@@ -137,12 +137,13 @@ class Central:
             values = seen.get("context_values") or [after[episodes.indices]]
             yield dataclasses.replace(episodes, start_values=checked(np.concatenate(values), "start values"))
 
-    def _probed(self, version: int, parts: list[Outcomes]) -> Probes | None:
+    def _probed(self, state: State, seen: Mapping[str, list[Any]]) -> Probes | None:
+        parts: list[Outcomes] = seen.get("probes", [])
         if not parts:
             return None
-        indices = self.curriculum.probes(version)
+        indices = self.curriculum.probes(state, next(iter(seen.get("episodes", [])), None))
         if indices is None:
-            raise RuntimeError(f"selection {version} was probed, and nobody asked for that")
+            raise RuntimeError(f"selection {state.version} was probed, and nobody asked for that")
         outcomes = joined(parts)
         if np.isnan(outcomes.success).any():
             raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")

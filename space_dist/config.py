@@ -371,7 +371,11 @@ class LevelReplayConfig(_Curriculum):
     temperature: float = Field(default=0.1, gt=0.0)
     """Beta: the chance of rank r is proportional to r^(-1/beta). Source: Jiang et al. 2021 (0.1)."""
     staleness_share: float = Field(default=0.1, ge=0.0, le=1.0)
-    """Rho: weight of the time since an instance was last trained on. Source: Jiang et al. 2021 (0.1)."""
+    """Rho: weight of the episodes since an instance was last trained on. Source: Jiang et al. 2021 (0.1)."""
+    within_update: Literal["without_repetition", "fixed_chances"] = "without_repetition"
+    """How the episodes of one update are drawn, between which no score can change. without_repetition: what was drawn
+    leaves the ranking until everything else was. fixed_chances: the paper's chances as they stand, by which one
+    instance has nearly all episodes of an update. Source: ours; Jiang et al. 2021, who decide before each episode."""
 
 
 class LearnabilityConfig(_Curriculum):
@@ -387,7 +391,8 @@ class LearnabilityConfig(_Curriculum):
     uniform_share: float = Field(default=0.5, ge=0.0, le=1.0)
     """Share of draws from all instances. Source: Rutherford et al. 2024 (0.5)."""
     every: int = Field(default=50, ge=1)
-    """Iterations between probes; the first follows the first iteration. Source: Rutherford et al. 2024 (50)."""
+    """Iterations between probes, at least; the first follows the first training episode that succeeds: before, every
+    rate would be 0. Source: Rutherford et al. 2024 (50); the wait is ours."""
     candidates: int | None = Field(default=None, ge=1)
     """Instances that a probe takes, at random; null: all. Source: ours."""
     episodes: int = Field(default=4, ge=2, le=1000)

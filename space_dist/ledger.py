@@ -5,6 +5,8 @@
                           the hashes of the files that are written whole
     metrics.jsonl         one row per iteration and per evaluation; a pure function of config and seed
     curriculum.jsonl      one row per iteration: which instances were trained on
+    values.jsonl          one row per decision: the start values of all instances behind it (`encode_values`);
+                          row 0 is V_0, with the bounds of contexts. Not of sets above MOST_VALUED instances
     timing.jsonl          one row per row of metrics.jsonl: when, and how long it took
     checkpoints/*.npz     the last two; arrays and JSON, never a pickle
     replay/*.npz          what replay buffers hold, in pieces that are written once and named by the checkpoints
@@ -19,6 +21,7 @@ rows and pieces it covers, and of the configuration it belongs to; what is damag
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import dataclasses
 import errno
@@ -50,8 +53,9 @@ log = logging.getLogger("space_dist")
 Row = dict[str, Any]
 State = Literal["running", "interrupted", "failed", "done"]
 
-METRICS, TIMING, CURRICULUM = "metrics.jsonl", "timing.jsonl", "curriculum.jsonl"
-ROW_FILES = (METRICS, TIMING, CURRICULUM)
+METRICS, TIMING, CURRICULUM, VALUES = "metrics.jsonl", "timing.jsonl", "curriculum.jsonl", "values.jsonl"
+ROW_FILES = (METRICS, TIMING, CURRICULUM, VALUES)
+MOST_VALUED = 10_000  # instances whose start values are kept for every decision: some 50 kB a row
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
 LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
@@ -131,6 +135,24 @@ def decode_row(line: bytes) -> Row | None:
     except (ValueError, RecursionError):
         return None
     return row if isinstance(row, dict) else None
+
+
+def encode_values(values: NDArray[np.float64]) -> Row:
+    """(n,) start values, bit for bit: {"f4" or "f8": base64 of little-endian floats}; f4 where nothing is lost."""
+    with np.errstate(over="ignore"):
+        kind = "f4" if np.array_equal(values.astype(np.float32).astype(np.float64), values) else "f8"
+    return {kind: base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()}
+
+
+def decode_values(encoded: object) -> NDArray[np.float64]:
+    """The inverse of `encode_values`. Raises LedgerError for anything else."""
+    try:
+        ((kind, text),) = dict(encoded).items()  # type: ignore[call-overload]
+        if kind not in ("f4", "f8"):
+            raise ValueError(kind)
+        return np.frombuffer(base64.b64decode(text, validate=True), dtype=f"<{kind}").astype(np.float64)
+    except (ValueError, TypeError):
+        raise LedgerError("start values are a JSON object of one key, f4 or f8, with floats in base64") from None
 
 
 class Ledger:
@@ -545,7 +567,7 @@ class RunWriter:
             if hashlib.sha256(content).hexdigest() != sha256:
                 raise ValueError(f"{name} has changed since")
             prefixes[name] = content
-        return prefixes
+        return {**dict.fromkeys(ROW_FILES, b""), **prefixes}  # a file that is younger than the checkpoint holds nothing
 
     def _cut(self, prefixes: Mapping[str, bytes]) -> None:
         for name, content in prefixes.items():

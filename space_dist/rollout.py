@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, Observations, make_batched
-from space_dist.envs.observations import allocate, concatenate, put, rows, take
+from space_dist.envs.observations import allocate, concatenate, distinct, put, rows, take
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.policy import Noise, Policy, Several, Valuing, members_of, side_by_side
@@ -256,7 +256,7 @@ class Worker:
         self._stages: dict[int, Stage] = {}  # by shard; what is beyond LIVE shares one
         self._evaluating: dict[int, BatchedEnv] = {}
         self._scoring: BatchedEnv | None = None
-        self._starts: dict[int, Observations] = {}
+        self._starts: dict[int, tuple[Observations, IntArray | None]] = {}
 
     def collect(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> Shard:
         """One shard of one round; `asked`: see `Setup.rollout`."""
@@ -272,13 +272,15 @@ class Worker:
     def start_values(self, policy: Valuing, chunk: int) -> FloatArray:
         """`(chunk_size, ...)` V(s0, c_i) of one chunk of the training instances: means over their start observations.
 
-        `...` is what follows the first axis of `policy.values`.
+        `...` is what follows the first axis of `policy.values`. Equal observations have equal values: each is scored
+        once.
         """
         if chunk not in self._starts:
-            self._starts[chunk] = start_observations(self._setup, chunk)
-        observations = self._starts[chunk]
+            self._starts[chunk] = distinct(start_observations(self._setup, chunk))
+        observations, which = self._starts[chunk]
         starts = range(0, rows(observations), BLOCK)
         values = np.concatenate([policy.values(take(observations, slice(row, row + BLOCK))) for row in starts])
+        values = values if which is None else values[which]
         means: FloatArray = values.reshape(-1, self._setup.start_states, *values.shape[1:]).mean(axis=1)
         return means
 

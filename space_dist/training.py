@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
-from space_dist.config import PPOConfig, RunConfig, TRPOConfig
+from space_dist.config import GrowingConfig, PPOConfig, RunConfig, TRPOConfig
 from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
@@ -56,7 +56,19 @@ from space_dist.learner import (
     refuse_spaces,
     stack_key,
 )
-from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Row, RunWriter, Segment, Status
+from space_dist.ledger import (
+    CURRICULUM,
+    METRICS,
+    MOST_VALUED,
+    TIMING,
+    VALUES,
+    Checkpoint,
+    Row,
+    RunWriter,
+    Segment,
+    Status,
+    encode_values,
+)
 from space_dist.policy import MlpPolicy, Policy, Several, Statistics, blind, members_of, to_arrays
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
 from space_dist.seeding import member_seeds
@@ -311,7 +323,12 @@ class Training:
         if self.learner.normalises:
             yield from self._probe()
         policy = cluster.put(self.learner.policy(0))
-        self._adopt(cluster.begin(cluster.start_values(policy)))
+        first = cluster.begin(cluster.start_values(policy))
+        self._adopt(first)
+        bounds = make_env(self._config).context_bounds
+        if len(self._setup.train) > MOST_VALUED:
+            log.info("%d instances: above %d, %s is not written", len(self._setup.train), MOST_VALUED, VALUES)
+        self._keep_values({"iteration": 0, "low": bounds.low.tolist(), "high": bounds.high.tolist()}, first)
         self._evaluate(policy)
         return policy
 
@@ -342,10 +359,10 @@ class Training:
         """Gather what the curriculum asks for and let it choose; the answer is picked up at the next wait."""
         run, cluster = self._run, self._cluster
         probes = yield from self._probe_instances(policy)
+        evidence = self._evidence(policy, probes)
         decision = cluster.decide(
-            run.state, run.values, self._evidence(policy, probes),
-            version=run.version, gradient_steps=run.gradient_steps,
-        )  # fmt: skip
+            run.state, run.values, evidence, version=run.version, gradient_steps=run.gradient_steps
+        )
         row = self._iteration_row(complete=True)
 
         def settle(answers: list[Any]) -> None:
@@ -354,10 +371,22 @@ class Training:
             self.progress.set_size = int(answers[0]["size"])
 
         run.pending.append(_Pending([decision.numbers], settle))
+        self._keep_values({"iteration": run.iteration}, decision, evidence.rescored)
         self._adopt(decision)
         run.iteration += 1
         run.version += 1
         run.rollouts, run.updates, run.seen, run.gradient_steps = [], [], [], 0
+
+    def _keep_values(self, row: Row, decision: Decision, rescored: Sequence[Handle] = ()) -> None:
+        """Write down what a decision is made from, once that is known, so that anybody can make it again."""
+        if len(self._setup.train) > MOST_VALUED:
+            return
+
+        def settle(answers: list[Any]) -> None:
+            before = {"before": encode_values(np.concatenate(answers[1:]))} if len(answers) > 1 else {}
+            self._writer.append(VALUES, {**row, **before, "after": encode_values(answers[0])})
+
+        self._run.pending.append(_Pending([decision.values, *rescored], settle))
 
     def _probe_instances(self, policy: Handle) -> Work[list[Outcomes]]:
         """Run the probe episodes that the curriculum asks for, if any, and charge their steps to the budget.
@@ -365,7 +394,10 @@ class Training:
         There are none where they, at their longest, would leave no room for another round.
         """
         run, cluster = self._run, self._cluster
-        indices = self._curriculum.probes(run.version)
+        if not self._config.curriculum.probes:
+            return []
+        (state,) = yield from self._settle([run.state])
+        indices = self._curriculum.probes(state, joined_episodes(run.seen))
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
         outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))
@@ -376,7 +408,9 @@ class Training:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
         rescored, members, episodes, context_values = [], [], [], []
-        if isinstance(self.learner, Learner) and self.learner.normalises:
+        growing = self._config.curriculum
+        from_zero = run.version == 0 and isinstance(growing, GrowingConfig) and growing.v0 == "zero"
+        if isinstance(self.learner, Learner) and self.learner.normalises and not from_zero:
             # Both values at one scale: else a change of scale would look like progress.
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         if self.ensemble is not None:

@@ -33,7 +33,8 @@ def test_importing_us_settles_this_process_and_its_children() -> None:
 
 @pytest.mark.parametrize("given", ["AVX2", "AUTO", "COMPATIBLE"])
 def test_ours_wins_over_the_users_and_says_so(given: str) -> None:
-    said = fresh("import sys; sys.argv[1:] = ['--help']; from space_dist.cli import main; main()", MKL_CBWR=given).stderr
+    code = "import sys; sys.argv[1:] = ['--help']; from space_dist.cli import main; main()"
+    said = fresh(code, MKL_CBWR=given).stderr
     assert said == (
         "" if given == "COMPATIBLE" else
         f"space-dist: MKL_CBWR={given} of the environment is overruled by MKL_CBWR=COMPATIBLE: results are the same on "

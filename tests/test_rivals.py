@@ -36,7 +36,7 @@ from space_dist.curricula.alp_gmm import AlpGmm, MixtureState, absolute_progress
 from space_dist.curricula.configured import Makers
 from space_dist.curricula.draws import effective_size, proportional
 from space_dist.curricula.learnability import Learnability, learnable_chances
-from space_dist.curricula.plr import LevelReplay, ReplayState, replay_chances
+from space_dist.curricula.plr import LevelReplay, ReplayState, replay_chances, replayed
 from space_dist.curricula.vds import ValueDisagreement, disagreement
 from space_dist.envs import make_batched
 from space_dist.episodes import mean_sizes
@@ -46,6 +46,7 @@ from space_dist.learner import Ensemble, make_learner
 from space_dist.policy import EnsemblePolicy, Statistics
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout import Setup, Shard, Worker
+from space_dist.seeding import Purpose, generator
 from space_dist.training import make_setup
 from space_dist.walk import Walk
 from tests.tiny_env import Line
@@ -231,8 +232,6 @@ def test_stacked_members_take_the_steps_that_each_would_take_alone() -> None:
             layer.weight.copy_(torch.as_tensor(weight.T))
             layer.bias.copy_(torch.as_tensor(bias))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3, eps=1e-5)
-    from space_dist.seeding import Purpose, generator
-
     random = generator(0, Purpose.ENSEMBLE_UPDATE, 0)
     for _ in range(20):
         batch = random.choice(128, size=64, replace=False)
@@ -277,23 +276,98 @@ def test_the_chances_of_replay_by_hand() -> None:
 
 
 def test_what_was_never_trained_on_comes_first() -> None:
-    plr = LevelReplay(instances(5), seed=0, draws=Draws(20, 2), temperature=0.1, staleness_share=0.1)
+    plr = LevelReplay(
+        instances(5), seed=0, draws=Draws(20, 2), temperature=0.1, staleness_share=0.1, within_update="fixed_chances"
+    )
     state, selection = plr.start()
-    heads = np.stack([selection.ids[:10], selection.ids[10:]], axis=1).ravel()  # the order in which two walks use them
+    heads = in_order(selection)
     assert sorted(heads[:5]) == [10, 11, 12, 13, 14]
     trained = heads[:3] - 10
     told = feedback(0, [*trained, trained[0]], n=5, advantages=[1.0, 3.0, 2.0, 2.0])
     state, selection, numbers = plr.step(state, told)
     assert state.scores[trained].tolist() == [1.5, 3.0, 2.0]  # two episodes of the first: their mean
-    assert state.last[trained].tolist() == [0, 0, 0]
+    assert (state.last[trained].tolist(), state.episodes) == ([3, 1, 2], 4)  # the run's episodes, counted from 0
     assert (numbers["seen"], numbers["largest_score"]) == (3, 3.0)
-    heads_after = np.stack([selection.ids[:10], selection.ids[10:]], axis=1).ravel()
+    heads_after = in_order(selection)
     assert heads_after[:2].tolist() == heads[3:5].tolist()  # still unseen, in the same order
     assert set(heads_after[2:]) <= set(heads[:3])
-    assert state.chances[trained[1]] == state.chances.max()
-    state, _, _ = plr.step(state, feedback(1, [int(trained[0])], n=5, advantages=9.0))
+    # Ranks 3, 1, 2, and 0, 2 and 1 episodes since the last: 1 / 10 of 0, 2 / 3 and 1 / 3.
+    by_rank = np.array([3.0, 1.0, 2.0]) ** -10.0
+    expected = 0.9 * by_rank / by_rank.sum() + 0.1 * np.array([0.0, 2.0, 1.0]) / 3.0
+    np.testing.assert_allclose(state.chances[trained], expected)
+    state, selection, _ = plr.step(state, feedback(1, [int(trained[0])], n=5, advantages=9.0))
     assert state.scores[trained].tolist() == [9.0, 3.0, 2.0]
-    assert state.last[trained].tolist() == [1, 0, 0]
+    assert state.last[trained].tolist() == [4, 1, 2]
+    assert (in_order(selection)[2:] == 10 + trained[0]).mean() > 0.5  # of the one of the highest score, again and again
+
+
+def in_order(selection: Any, walks: int = 2) -> np.ndarray:
+    """The ids of a selection in the order in which `walks` walks use them."""
+    return selection.ids.reshape(walks, -1).T.ravel()
+
+
+def replayed_by_hand(
+    scores: list[float], last: list[int], episodes: int, uniform: np.ndarray, beta: float, rho: float
+) -> list[int]:
+    """Jiang et al.'s rule, episode for episode, over what was not played yet: fractions instead of cumulative sums."""
+    last, left, played = list(last), [], []
+    for now, (which, point) in enumerate(uniform, start=episodes):
+        left = left or list(range(len(scores)))
+        ranked = sorted(left, key=lambda one: -scores[one])
+        if which < rho:
+            weights = [now - 1 - last[one] for one in ranked]
+            weights = weights if any(weights) else [1.0] * len(ranked)
+        else:
+            weights = [(rank + 1) ** (-1.0 / beta) for rank in range(len(ranked))]
+        shares = itertools.accumulate(weight / math.fsum(weights) for weight in weights)
+        one = next(one for one, below in zip(ranked, shares, strict=True) if point < below)
+        left.remove(one)
+        last[one] = now
+        played.append(one)
+    return played
+
+
+@pytest.mark.parametrize(("beta", "rho"), [(0.1, 0.1), (1.0, 0.3), (0.3, 1.0), (2.0, 0.0)])
+def test_draws_without_repetition_are_the_rule_of_each_episode_over_what_is_left(beta: float, rho: float) -> None:
+    random = np.random.default_rng(0)
+    scores, staleness, uniform = random.random(9), random.permutation(30)[:9], random.random((200, 2))
+    ranked = np.argsort(-scores)
+    found = replayed(ranked, staleness[ranked], uniform, beta, rho)
+    assert found.tolist() == replayed_by_hand(scores.tolist(), (29 - staleness).tolist(), 30, uniform, beta, rho)
+    passes = np.append(found, found[:7]).reshape(-1, 9)[:22]  # 22 whole passes, and the rest of the 200
+    assert (np.sort(passes, axis=1) == np.arange(9)).all()
+
+
+def test_the_first_draw_has_the_papers_chances() -> None:
+    scores, staleness, count = np.array([3.0, 1.0, 2.0, 9.0]), np.array([0, 3, 1, 7]), 4000
+    expected = replay_chances(scores, staleness, np.ones(4, dtype=np.bool_), np.arange(4, dtype=np.uint64), 1.0, 0.25)
+    random, ranked = np.random.default_rng(1).random((count, 1, 2)), np.argsort(-scores)
+    first = np.concatenate([replayed(ranked, staleness[ranked], one, 1.0, 0.25) for one in random])
+    shares = np.bincount(first, minlength=4) / count
+    assert (np.abs(shares - expected) < 5 * np.sqrt(expected * (1 - expected) / count)).all()
+
+
+def test_one_instance_does_not_take_all_episodes_of_an_update_unless_asked_to() -> None:
+    scores = np.array([1.0, 5.0, 4.0, 3.0, 2.0])
+    spreads = {}
+    for rule in ("without_repetition", "fixed_chances"):
+        plr = LevelReplay(
+            instances(5), seed=0, draws=Draws(20, 2), temperature=0.1, staleness_share=0.1, within_update=rule
+        )
+        state, _ = plr.start()
+        state, selection, numbers = plr.step(state, feedback(0, range(5), n=5, advantages=scores))
+        spreads[rule] = numbers["effective_size"]
+        drawn = in_order(selection)
+        if rule == "without_repetition":
+            assert (np.sort(drawn.reshape(4, 5), axis=1) == np.arange(10, 15)).all()
+            uniform = generator(0, Purpose.DRAWS, 1).random((20, 2))
+            by_hand = replayed_by_hand(scores.tolist(), [0, 1, 2, 3, 4], 5, uniform, 0.1, 0.1)
+            assert drawn.tolist() == [10 + one for one in by_hand]
+        else:
+            assert (drawn == 11).mean() > 0.5
+    assert spreads["without_repetition"] == pytest.approx(5.0)
+    assert spreads["fixed_chances"] < 3.0
+    assert configs.load(SPACE, ["curriculum={kind: plr}"]).curriculum.within_update == "without_repetition"
 
 
 def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:
@@ -364,10 +438,11 @@ def test_probes_are_counted_per_instance_and_old_rates_stand() -> None:
     sfl = Learnability(
         instances(5), seed=0, draws=Draws(20, 2), top=1, uniform_share=0.5, every=3, candidates=2, episodes=4
     )
-    asked = [sfl.probes(version) for version in range(7)]
-    assert [one is not None for one in asked] == [True, False, False, True, False, False, True]
-    assert all(len(set(one)) == 2 and len(one) == 8 for one in asked if one is not None)
     state, _ = sfl.start()
+    won = dataclasses.replace(state, succeeded=True)
+    asked = [sfl.probes(dataclasses.replace(won, version=version), None) for version in range(7)]
+    assert all(one is not None and len(set(one)) == 2 and len(one) == 8 for one in asked)
+    assert len({tuple(one) for one in asked if one is not None}) > 1  # other candidates each time
     probes = Probes(np.repeat([1, 3], 4), np.zeros(8), np.full(8, 5), np.array([1, 0, 0, 0, 1, 1, 0, 0], dtype=float))
     state, _, numbers = sfl.step(state, feedback(0, [0], n=5, probes=probes))
     assert state.success.tolist() == [0.0, 0.25, 0.0, 0.5, 0.0]
@@ -381,6 +456,34 @@ def test_probes_are_counted_per_instance_and_old_rates_stand() -> None:
     np.testing.assert_allclose(state.chances, [0.1, 0.6, 0.1, 0.1, 0.1])
 
 
+def test_the_first_probe_waits_for_the_first_success_and_the_next_for_its_turn() -> None:
+    sfl = Learnability(
+        instances(3), seed=0, draws=Draws(20, 2), top=1, uniform_share=0.5, every=3, candidates=None, episodes=2
+    )
+    # Iterations in which a training episode succeeds, and whether the budget has room when a probe is asked for.
+    wins = [False, False, True, False, False, False, True, False, False]
+    room = [True, True, True, True, True, False, True, True, True]
+    state, asked = sfl.start()[0], []
+    for version, (win, some) in enumerate(zip(wins, room, strict=True)):
+        told = feedback(version, [0, 1], n=3)
+        assert told.episodes is not None
+        told.episodes.success[0] = float(win)
+        indices = sfl.probes(state, told.episodes)
+        asked.append(indices is not None)
+        if indices is not None and some:
+            probes = Probes(indices, np.zeros(6), np.full(6, 5), np.array([1, 0, 0, 0, 0, 0], dtype=float))
+            told = dataclasses.replace(told, probes=probes)
+        state, _, numbers = sfl.step(state, told)
+        assert numbers["probe_steps"] == (30 if told.probes else 0)
+    # The first success is in iteration 2. Due again in 5, where there is no room, so in 6; then in 9.
+    assert asked == [False, False, True, False, False, True, True, False, False]
+    assert (state.due, state.succeeded) == (9, True)
+    unknown = feedback(0, [0], n=3)
+    assert unknown.episodes is not None
+    unknown.episodes.success[:] = np.nan
+    assert sfl.probes(sfl.start()[0], unknown.episodes) is None
+
+
 # ---- ALP-GMM --------------------------------------------------------------------------------------------------------
 
 
@@ -388,7 +491,9 @@ def test_absolute_learning_progress_by_hand() -> None:
     contexts = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5], [0.2, 0.0], [0.9, 0.1], [0.0, 1.0]])
     returns = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     assert absolute_progress(np.array([0.45, 0.5]), 10.0, contexts, returns) == 7.0
-    assert absolute_progress(np.array([0.1, 0.0]), 0.0, contexts, returns) == 1.0  # as near as the fourth, and older
+    assert absolute_progress(np.array([0.1, 0.0]), 0.0, contexts, returns) == 4.0  # as near as the first, and newer
+    played = np.concatenate([contexts, contexts[:1]])
+    assert absolute_progress(contexts[0], 9.0, played, np.append(returns, 7.5)) == 1.5  # the last time it was played
     assert absolute_progress(np.array([0.45, 0.5]), 10.0, contexts[:5], returns[:5]) == 0.0  # five are too few
 
 
@@ -463,9 +568,9 @@ def test_the_first_fit_comes_after_fit_rate_finished_episodes(from_set: bool) ->
     state, _, numbers = one.step(state, told)
     assert (numbers["finished_episodes"], numbers["fitted"], len(state.means)) == (15, False, 0)
     # Two contexts in turn. The seventh episode is the first that has more than five before it. Each is compared with
-    # the oldest of its context: return 0 or 1.
+    # the newest of its context, two episodes ago.
     assert state.returns.tolist() == np.arange(15.0).tolist()
-    assert state.recent[:, -1].tolist() == [0.0] * 6 + [6.0, 6.0, 8.0, 8.0, 10.0, 10.0, 12.0, 12.0, 14.0]
+    assert state.recent[:, -1].tolist() == [0.0] * 6 + [2.0] * 9
     state, selection, numbers = one.step(state, dataclasses.replace(told, version=1))
     assert (numbers["finished_episodes"], numbers["fitted"]) == (30, True)
     assert len(state.means) >= 2
@@ -571,7 +676,10 @@ def driven(curriculum: Curriculum, train: InstanceSet, steps: int = 4, through: 
         ids = selection.ids[some]
         indices = np.where(ids < 0, -1, np.searchsorted(train.ids, ids))
         m, n = len(some), len(train)
-        probes, asked = None, curriculum.probes(version)
+        won = feedback(version, [0], n=n).episodes
+        assert won is not None
+        won.success[:] = 1.0
+        probes, asked = None, curriculum.probes(state, won)
         if asked is not None:
             success = random.integers(2, size=len(asked)).astype(float)
             probes = Probes(asked, np.zeros(len(asked)), np.ones(len(asked), dtype=np.int64), success)

@@ -17,6 +17,7 @@ from space_dist.config import PPOConfig
 from space_dist.curricula import Selection
 from space_dist.envs import ContextObservation, make_batched
 from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
+from space_dist.envs.observations import distinct
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.learner import make_learner
 from space_dist.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
@@ -553,6 +554,41 @@ def test_joined_chunks_equal_one_big_evaluation() -> None:
     scaled = 2.0 * (contexts - LOW) / (HIGH - LOW) - 1.0
     observed = np.concatenate([np.tile([0.0, 0.0, 3.0, 0.0], (n, 1)), scaled], axis=1).astype(np.float32)
     np.testing.assert_allclose(told, weights.values(observed), rtol=1e-5, atol=1e-6)
+
+
+def test_equal_starts_have_equal_values_wherever_they_stand() -> None:
+    """A matrix product rounds a row by its place in it: hidden contexts tied, or did not, by their row."""
+    n = 150
+    hidden = setup_for(
+        context_visible=False,
+        train=InstanceSet(np.arange(n), uniform(n), ("gate_x", "gate_width", "friction")),
+    )
+    worker = Worker(hidden)
+    for seed in range(5):
+        assert len(set(worker.start_values(weights_for(4, 2, seed=seed, hidden=64), 0).tolist())) == 1
+    # Seven different contexts, again and again.
+    few = np.random.default_rng(0).integers(7, size=n)
+    setup = setup_for(train=InstanceSet(np.arange(n), uniform(7)[few], ("gate_x", "gate_width", "friction")))
+    values = Worker(setup).start_values(weights_for(7, 2, hidden=64), 0)
+    assert len(set(values.tolist())) == 7
+    assert len(set(zip(values.tolist(), few.tolist(), strict=True))) == 7
+
+
+def test_rows_that_differ_are_found_once_and_all_stay_as_they_stand_where_all_differ() -> None:
+    table = np.array([[0.0, 2.0], [1.0, 2.0], [-0.0, 2.0], [1.0, 2.0]])
+    found, which = distinct({"a": table, "b": np.zeros((4, 1, 2), dtype=np.int64)})
+    assert which is not None
+    assert isinstance(found, dict)
+    assert which[0] == which[2] != which[1] == which[3]
+    np.testing.assert_array_equal(found["a"][which], table)
+    assert found["b"].shape == (2, 1, 2)
+    same, none = distinct(table[:2])
+    assert same is not None
+    assert none is None
+    turned, other = distinct(table[::-1])  # the order of the rows that differ is their own
+    assert other is not None
+    np.testing.assert_array_equal(turned, distinct(table)[0])
+    assert distinct(np.zeros((3, 0)))[1] is None
 
 
 # ---- side by side ----

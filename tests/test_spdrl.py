@@ -189,6 +189,88 @@ def test_a_failed_search_counts_only_if_it_ends_feasible_and_better(
     assert (step.accepted, step.distribution.mean[0]) == (accepted, ends_at[0] if accepted else 0.0)
 
 
+def hard(seed: int) -> Objective:
+    """Moves on which trust-constr proposes log standard deviations of hundreds, or SciPy's own products overflow."""
+    random = np.random.default_rng(seed)
+    d = int(random.integers(1, 4))
+    target = random.normal(size=d) * random.choice([0, 1, 10, 100])
+    std = np.full(d, float(random.choice([0.01, 0.1, 1, 10])))
+    count = int(random.integers(2, 30))
+    contexts = random.standard_normal((count, d))
+    values = random.normal(size=count) * random.choice([1, 10, 100, 1e4])
+    values += random.choice([-1, 0, 1]) * random.choice([1, 10, 100, 1e5])
+    alpha = float(random.choice([0, 0, 1e-3, 1, 1e2, 1e5]))
+    return Objective(Gaussian.of(np.zeros(d), np.ones(d)), Gaussian.of(target, std), contexts, values, alpha)
+
+
+@pytest.mark.parametrize("seed", [13, 82, 110])
+def test_a_move_ends_within_the_trust_region_whatever_the_search_proposes(seed: int) -> None:
+    problem = hard(seed)
+    step = by_trust_region(problem, EPSILON, None)
+    assert step.accepted
+    assert problem.old.kl_to(step.distribution) <= EPSILON * (1.0 + 1e-6)
+    assert problem.value(step.distribution.parameters) > problem.value(problem.old.parameters)
+
+
+def proposing(monkeypatch: pytest.MonkeyPatch, proposals: list[list[float]], times: int) -> list[float]:
+    """Let `minimize` ask for the value at `proposals` before it begins, `times` times; returns its first radii."""
+    radii: list[float] = []
+    truly = spdrl.minimize
+
+    def minimize(function: Any, start: np.ndarray, **options: Any) -> Any:
+        radii.append(options["options"]["initial_tr_radius"])
+        for proposal in proposals if len(radii) <= times else []:
+            function(np.array(proposal))
+        return truly(function, start, **options)
+
+    monkeypatch.setattr(spdrl, "minimize", minimize)
+    return radii
+
+
+def test_a_proposal_that_is_no_number_is_refused_and_the_search_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = line(0.0, some(1, 1))
+    undisturbed = by_trust_region(problem, EPSILON, None)
+    radii = proposing(monkeypatch, [[0.1, 0.0], [0.0, 800.0]], times=2)
+    step = by_trust_region(problem, EPSILON, None)
+    assert (step.accepted, step.refused, len(radii)) == (True, 2, 3)
+    assert radii == sorted(radii, reverse=True)
+    np.testing.assert_allclose(step.distribution.parameters, undisturbed.distribution.parameters, atol=1e-3)
+
+
+def test_if_nothing_but_refused_proposals_comes_the_best_before_them_or_the_old_one_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = line(0.0, some(1, 1))
+    with monkeypatch.context() as patched:
+        proposing(patched, [[0.1, 0.0], [0.0, 800.0]], times=99)
+        step = by_trust_region(problem, EPSILON, None)
+        assert (step.accepted, step.distribution.mean.tolist(), step.refused) == (True, [0.1], 3)
+    for nothing in ([0.0, 800.0], [0.0, -800.0], [np.nan, 0.0], [np.inf, 0.0]):
+        with monkeypatch.context() as patched:
+            proposing(patched, [nothing], times=99)
+            step = by_trust_region(problem, EPSILON, None)
+            assert (step.accepted, step.refused) == (False, 3)
+            assert step.distribution is problem.old
+
+
+def test_a_run_whose_search_finds_no_distribution_goes_on_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    proposing(monkeypatch, [[0.0, 0.0, 800.0, 0.0, 0.0]], times=99)
+    one = curriculum(warm_up=0)
+    state, selection = one.start()
+    after, _, numbers = one.step(state, feedback(state, selection.contexts))
+    assert (numbers["moved"], numbers["refused_proposals"], after.version) == (False, 3, 1)
+    assert after.distribution.parameters.tolist() == state.distribution.parameters.tolist()
+
+
+@pytest.mark.parametrize("values", [1e308, np.array([1e308, -1e308] * 6)])
+def test_values_too_large_for_a_gradient_move_nothing(values: Any) -> None:
+    for optimiser in ("trust_constr", "conjugate_gradient"):
+        one = curriculum(warm_up=0, optimiser=optimiser)
+        state, selection = one.start()
+        _, _, numbers = one.step(state, feedback(state, selection.contexts, values))
+        assert not numbers["moved"]
+
+
 # ---- the curriculum ---------------------------------------------------------------------------------------------
 
 BOUNDS = ContextBounds(("a", "b"), np.array([-1.0, 0.0]), np.array([1.0, 2.0]))

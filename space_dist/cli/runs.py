@@ -1,4 +1,4 @@
-"""Commands about runs: train, evaluate, report, sync."""
+"""Commands about runs: train, evaluate, explain, report, sync."""
 
 from __future__ import annotations
 
@@ -120,6 +120,26 @@ def evaluate(
     console.print(table)
     if out is None:
         delivered()
+
+
+def explain(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
+) -> None:
+    """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 12)."""
+    from space_dist.instances import read_csv
+    from space_dist.launch import stored_config
+    from space_dist.ledger import Ledger
+    from space_dist.report.decisions import explain as explain_decision
+    from space_dist.training import make_env
+
+    ledger = Ledger(run)
+    ledger.status()
+    config = stored_config(ledger)
+    ledger.read(ledger.instances("train"))
+    train = read_csv(ledger.instances("train"), make_env(config).context_bounds, config.curriculum.columns)
+    for line in explain_decision(ledger, config, train, iteration):
+        print(line)
 
 
 def report(

@@ -144,11 +144,14 @@ class AlpGmm(Curriculum):
 def absolute_progress(context: FloatArray, value: float, contexts: FloatArray, returns: FloatArray) -> float:
     """|value - the return of the nearest context of the history|; 0 while the history has no more than five.
 
-    context: (d,), contexts: (m, d), returns: (m,). Of equally near ones the oldest counts.
+    context: (d,), contexts: (m, d), returns: (m,), oldest first. Of equally near ones the newest counts: in a finite
+    set that is the last time the instance was played. Portelas et al. 2019 have continuous contexts, where none are
+    equal; the kd-tree of their code returns whichever it meets first.
     """
     if len(contexts) <= FEWEST_POINTS:
         return 0.0
-    nearest = int(((contexts - context) ** 2).sum(axis=1).argmin())
+    distances = ((contexts - context) ** 2).sum(axis=1)
+    nearest = len(distances) - 1 - int(distances[::-1].argmin())
     return abs(value - float(returns[nearest]))
 
 

@@ -139,7 +139,7 @@ class Makers:
     def _level_replay(self, settings: LevelReplayConfig) -> LevelReplay:
         return LevelReplay(
             self._train, seed=self._seed, draws=self._draws, temperature=settings.temperature,
-            staleness_share=settings.staleness_share,
+            staleness_share=settings.staleness_share, within_update=settings.within_update,
         )  # fmt: skip
 
     def _learnability(self, settings: LearnabilityConfig) -> Learnability:

@@ -192,6 +192,9 @@ class Curriculum(abc.ABC):
     def selection(self, state: Any) -> Selection:
         """The selection that belongs to a state."""
 
-    def probes(self, version: int) -> IntArray | None:  # noqa: ARG002 - most ask for none
-        """`(k,)` indices of instances, one for each episode that the feedback on selection `version` shall probe."""
+    def probes(self, state: Any, episodes: Episodes | None) -> IntArray | None:  # noqa: ARG002 - most ask for none
+        """`(k,)` indices of instances, one for each episode that the feedback on `state`'s selection shall probe.
+
+        episodes: the iteration's, if `Wants.episodes`; their start values need not be known yet. Pure.
+        """
         return None

@@ -7,27 +7,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from space_dist.curricula.draws import Drawn, DrawnState, Draws, uniform
-from space_dist.curricula.interface import BoolArray, Feedback, FloatArray, IntArray, Numbers, Selection
+from space_dist.curricula.interface import BoolArray, Episodes, Feedback, FloatArray, IntArray, Numbers, Selection
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, UInt64Array, generator, instance_keys
 
 
 @dataclass(frozen=True)
 class ProbedState(DrawnState):
-    """success: (n,) rate when an instance was last probed; 0 where it never was.  probed: (n,) whether it was."""
+    """success: (n,) rate when an instance was last probed; 0 where it never was.  probed: (n,) whether it was.
+
+    succeeded: whether any training episode has.  due: the version from which on the next probe is made.
+    """
 
     success: FloatArray
     probed: BoolArray
+    succeeded: bool
+    due: int
 
 
 class Learnability(Drawn):
     """Draws from the instances of highest p (1 - p), mixed with all of them.
 
-    p is the success rate of the acting policy, noise and all, in probe episodes, which cost environment steps.
+    p is the success rate of the acting policy, noise and all, in probe episodes, which cost environment steps. As long
+    as no training episode succeeds, a probe would find 0 everywhere: there is none, and draws are uniform.
 
     top: how many instances are drawn as learnable.
     uniform_share: the chance of a draw to be from all instances.
-    every: iterations between two probes; the first follows the first iteration.
+    every: iterations between two probes; the first follows the first iteration in which an episode succeeds.
     candidates: how many instances a probe takes, chosen at random; None: all.
     episodes: probe episodes of each.
     """
@@ -43,9 +49,10 @@ class Learnability(Drawn):
         self._candidates, self._episodes = candidates, episodes
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
 
-    def probes(self, version: int) -> IntArray | None:
+    def probes(self, state: ProbedState, episodes: Episodes | None) -> IntArray | None:
         """Every candidate as often as it has episodes."""
-        if version % self._every:
+        version = state.version
+        if version < state.due or not _succeeded(state, episodes):
             return None
         n = len(self._instances)
         candidates = np.arange(n)
@@ -57,25 +64,34 @@ class Learnability(Drawn):
     def start(self) -> tuple[ProbedState, Selection]:
         """Nothing was probed yet, so every instance has the same chance."""
         n = len(self._instances)
-        state = ProbedState(0, uniform(n), success=np.zeros(n), probed=np.zeros(n, dtype=np.bool_))
+        state = ProbedState(
+            0, uniform(n), success=np.zeros(n), probed=np.zeros(n, dtype=np.bool_), succeeded=False, due=0
+        )  # fmt: skip
         return state, self.selection(state)
 
     def step(self, state: ProbedState, feedback: Feedback) -> tuple[ProbedState, Selection, Numbers]:
         """New success rates where instances were probed; the old ones stand elsewhere."""
-        success, probed, steps, n = state.success, state.probed, 0, len(self._instances)
+        success, probed, due, steps, n = state.success, state.probed, state.due, 0, len(self._instances)
         if feedback.probes is not None:
             counts = np.bincount(feedback.probes.indices, minlength=n)
             sums = np.bincount(feedback.probes.indices, weights=feedback.probes.success, minlength=n)
             success = np.where(counts > 0, sums / np.maximum(counts, 1), success)
             probed, steps = probed | (counts > 0), int(feedback.probes.lengths.sum())
+            due = state.version + self._every
         scores = learnability(success)
         chances = learnable_chances(scores, self._ties, self._top, self._uniform_share)
-        new = ProbedState(state.version + 1, chances, success, probed)
+        succeeded = _succeeded(state, feedback.episodes)
+        new = ProbedState(state.version + 1, chances, success, probed, succeeded, due)
         numbers = self._numbers(feedback, chances)
         numbers |= {"probe_steps": steps, "probed": int(probed.sum()), "learnable": int((scores > 0.0).sum()),
                     "mean_learnability": float(scores.mean()),
                     "mean_success": float(success[probed].mean()) if probed.any() else None}  # fmt: skip
         return new, self.selection(new), numbers
+
+
+def _succeeded(state: ProbedState, episodes: Episodes | None) -> bool:
+    """Whether a training episode has succeeded, in this iteration or before it."""
+    return state.succeeded or (episodes is not None and bool((episodes.success == 1.0).any()))
 
 
 def learnability(success: FloatArray) -> FloatArray:

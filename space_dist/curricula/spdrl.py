@@ -11,8 +11,10 @@ instance sets of everyone. ../shared/reference/algorithm.md ("SPDRL") names what
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -38,10 +40,12 @@ LARGEST_ALPHA = 1e5
 SMALLEST_KL = 1e-10  # what alpha is divided by at least
 _LARGEST_LOG_RATIO = 50.0  # of densities; far outside any trust region
 _GTOL, _XTOL = 1e-4, 1e-6  # of trust-constr, as in the published code
+_FIRST_RADII = (1.0, 0.1, 0.01)  # of trust-constr; SciPy's own, and what is tried where that led nowhere
 _CG_STEPS = 10
 _LINE_SEARCH_STEPS, _SHRINK = 20, 0.8
 
 Optimiser = Literal["trust_constr", "conjugate_gradient"]
+Answer = TypeVar("Answer", float, FloatArray)
 
 
 @dataclass(frozen=True)
@@ -62,11 +66,15 @@ class ContextState(State):
 
 
 class Step(NamedTuple):
-    """One move of the distribution, whether it was taken, and how many iterations the optimiser made."""
+    """One move of the distribution, whether it was taken, and how many iterations the optimiser made.
+
+    refused: how often the search had to turn back from a proposal whose density or divergence is no number.
+    """
 
     distribution: Gaussian
     accepted: bool
     iterations: int
+    refused: int = 0
 
 
 class SelfPaced(Curriculum):
@@ -126,6 +134,7 @@ class SelfPaced(Curriculum):
             "kl_step": old.kl_to(moved.distribution),
             "moved": moved.accepted,
             "optimiser_iterations": moved.iterations,
+            "refused_proposals": moved.refused,
         }
         for which, one in (("", moved.distribution), ("target_", self._target)):
             for name, mean, std in zip(self._bounds.names, one.mean.tolist(), one.std.tolist(), strict=True):
@@ -188,26 +197,83 @@ class Objective:
         return np.exp(np.minimum(logs, _LARGEST_LOG_RATIO))
 
 
+class _NoNumberError(ArithmeticError):
+    """A proposed distribution has no density: its log standard deviations overflow or vanish as exponentials."""
+
+
+class _Search:
+    """An objective that an optimiser may ask about anything, and the best that it was asked about.
+
+    best: the parameters of highest value within the trust region, the start among them.
+    """
+
+    def __init__(self, objective: Objective, start: FloatArray, epsilon: float) -> None:
+        self._objective, self._epsilon = objective, epsilon
+        self.best, self._most = start, -np.inf
+
+    def value(self, parameters: FloatArray) -> float:
+        value = _number(self._objective.value, parameters)
+        if value > self._most and self.step_size(parameters) <= self._epsilon:
+            self.best, self._most = parameters.copy(), value
+        return value
+
+    def step_size(self, parameters: FloatArray) -> float:
+        return _number(self._objective.step_size, parameters)
+
+    def gradient(self, parameters: FloatArray) -> FloatArray:
+        return _number(self._objective.gradient, parameters)
+
+    def step_size_gradient(self, parameters: FloatArray) -> FloatArray:
+        return _number(self._objective.step_size_gradient, parameters)
+
+
+def _number(ask: Callable[[FloatArray], Answer], parameters: FloatArray) -> Answer:
+    """What `ask` answers. Raises _NoNumberError if that is no finite number."""
+    try:
+        with np.errstate(all="ignore"):
+            answer = ask(parameters)
+    except (ValueError, np.linalg.LinAlgError):  # SciPy's, of a factor that is infinite, or singular
+        raise _NoNumberError from None
+    if not np.isfinite(answer).all():
+        raise _NoNumberError
+    return answer
+
+
 def by_trust_region(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
-    """SciPy's trust-constr with analytic gradients. A failed search counts if it ends feasible and better."""
+    """SciPy's trust-constr with analytic gradients. A failed search counts if it ends feasible and better.
+
+    Now and then it proposes log standard deviations whose exponentials overflow. Such a proposal is refused, and the
+    search goes on from the best that it has found, with a smaller first step and a fresh estimate of the curvature,
+    which the refused one would spoil. Where nothing is found, the distribution stays.
+    """
     objective, start, low = _standardised(problem, least_std)
     # SciPy asks for a feasible start where bounds must not be left.
     start = start if low is None else np.maximum(start, low)
+    search, refused = _Search(objective, start, epsilon), 0
     trust = NonlinearConstraint(
-        objective.step_size, -np.inf, epsilon,
-        jac=lambda parameters: objective.step_size_gradient(parameters)[None], hess=BFGS(),
+        search.step_size, -np.inf, epsilon,
+        jac=lambda parameters: search.step_size_gradient(parameters)[None], hess=BFGS(),
     )  # fmt: skip
-    found = minimize(
-        lambda parameters: -objective.value(parameters), start, method="trust-constr",
-        jac=lambda parameters: -objective.gradient(parameters), hess=BFGS(), constraints=[trust],
-        bounds=None if low is None else Bounds(low, np.inf, keep_feasible=True),
-        options={"gtol": _GTOL, "xtol": _XTOL},
-    )  # fmt: skip
-    usable = bool(np.isfinite(found.x).all())
-    better = usable and objective.step_size(found.x) <= epsilon and objective.value(found.x) >= objective.value(start)
-    if usable and (found.success or better):
-        return Step(Gaussian.from_parameters(found.x).back_from(problem.old), True, int(found.nit))
-    return Step(problem.old, False, int(found.nit))
+    for first_radius in _FIRST_RADII:
+        try:
+            found = minimize(
+                lambda parameters: -search.value(parameters), search.best, method="trust-constr",
+                jac=lambda parameters: -search.gradient(parameters), hess=BFGS(), constraints=[trust],
+                bounds=None if low is None else Bounds(low, np.inf, keep_feasible=True),
+                options={"gtol": _GTOL, "xtol": _XTOL, "initial_tr_radius": first_radius},
+            )  # fmt: skip
+        except (_NoNumberError, ValueError, np.linalg.LinAlgError):  # ours; SciPy's own products may overflow as well
+            refused += 1
+            continue
+        with contextlib.suppress(_NoNumberError):
+            gained = search.value(found.x) - search.value(start)
+            if found.success or (search.step_size(found.x) <= epsilon and gained >= 0.0):
+                return Step(Gaussian.from_parameters(found.x).back_from(problem.old), True, int(found.nit), refused)
+        return Step(problem.old, False, int(found.nit), refused)
+    moved = not np.array_equal(search.best, start)
+    return Step(
+        Gaussian.from_parameters(search.best).back_from(problem.old) if moved else problem.old, moved, 0, refused
+    )
 
 
 def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatArray | None) -> Step:
@@ -216,19 +282,26 @@ def by_conjugate_gradient(problem: Objective, epsilon: float, least_std: FloatAr
     The standard deviations are clamped behind the step, so a clamped step may leave the trust region.
     """
     objective, start, low = _standardised(problem, least_std)
+    search, refused = _Search(objective, start, epsilon), 0
+    try:
+        before, gradient = search.value(start), search.gradient(start)
+    except _NoNumberError:
+        return Step(problem.old, False, 0, 1)
     fisher = objective.old.fisher()
-    direction, _ = cg(fisher, objective.gradient(start), maxiter=_CG_STEPS)
+    direction, _ = cg(fisher, gradient, maxiter=_CG_STEPS)
     length = float(direction @ fisher @ direction)
     if length > 0.0:
         step = np.sqrt(2.0 * epsilon / length) * direction
-        before = objective.value(start)
         for tried in range(1, _LINE_SEARCH_STEPS + 1):
             moved = start + step
-            if objective.step_size(moved) <= epsilon and objective.value(moved) > before:
-                moved = moved if low is None else np.maximum(moved, low)
-                return Step(Gaussian.from_parameters(moved).back_from(problem.old), True, tried)
+            try:
+                if search.step_size(moved) <= epsilon and search.value(moved) > before:
+                    moved = moved if low is None else np.maximum(moved, low)
+                    return Step(Gaussian.from_parameters(moved).back_from(problem.old), True, tried, refused)
+            except _NoNumberError:
+                refused += 1
             step = _SHRINK * step
-    return Step(problem.old, False, _LINE_SEARCH_STEPS)
+    return Step(problem.old, False, _LINE_SEARCH_STEPS, refused)
 
 
 def _standardised(problem: Objective, least_std: FloatArray | None) -> tuple[Objective, FloatArray, FloatArray | None]:

@@ -58,3 +58,23 @@ def alike(observations: Observations) -> bool:
     """Whether all rows are the same."""
     arrays = observations.values() if isinstance(observations, dict) else [observations]
     return all(bool((array == array[:1]).all()) for array in arrays)
+
+
+def distinct(observations: Observations) -> tuple[Observations, NDArray[np.int64] | None]:
+    """The rows that differ, and `(n,)` which of these each row is; where all differ, all as they stand, and None.
+
+    Rows of a matrix product are rounded by their place in it, so what must be equal for equal rows is computed once.
+    The rows that differ come in the order of their bytes, so that it does not hang on where they stood.
+    """
+    arrays = list(observations.values()) if isinstance(observations, dict) else [observations]
+    count = rows(observations)
+    exact = [array + array.dtype.type(0) if array.dtype.kind == "f" else array for array in arrays]  # -0.0 is 0.0
+    packed = [np.ascontiguousarray(array).reshape(count, -1).view(np.uint8) for array in exact]
+    joined = packed[0] if len(packed) == 1 else np.concatenate(packed, axis=1)
+    if not joined.shape[1]:  # of no numbers at all
+        return observations, None
+    whole = joined.view(np.dtype((np.void, joined.shape[1])))[:, 0]
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    if len(first) == count:
+        return observations, None
+    return take(observations, first), which.reshape(count).astype(np.int64)

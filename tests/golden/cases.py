@@ -10,11 +10,11 @@ from pathlib import Path
 from space_dist import config as configs
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
-from space_dist.ledger import CURRICULUM, METRICS
+from space_dist.ledger import CURRICULUM, METRICS, VALUES
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DIGESTS = Path(__file__).with_name("digests.json")
-FILES = (METRICS, CURRICULUM, "model.npz")
+FILES = (METRICS, CURRICULUM, VALUES, "model.npz")
 _TRAIN, _TEST = 12, 4  # instances: enough to choose from, and cheap to emulate
 
 _SHORT = [
