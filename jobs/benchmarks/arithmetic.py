@@ -44,10 +44,10 @@ def arithmetic(
             found.append(_measured(work, ours))
     table = Table("", "one arithmetic, steps/s", "libraries' own choice, steps/s", "ratio (least and most)")
     for work in WORKS:
-        ours, native = rates[work, True], rates[work, False]
-        ratios = [one / other for one, other in zip(ours, native, strict=True)]
+        settled, native = rates[work, True], rates[work, False]
+        ratios = [one / other for one, other in zip(settled, native, strict=True)]
         table.add_row(
-            work, f"{statistics.median(ours):,.0f}", f"{statistics.median(native):,.0f}",
+            work, f"{statistics.median(settled):,.0f}", f"{statistics.median(native):,.0f}",
             f"{statistics.median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f})",
         )  # fmt: skip
     console.print(table)
