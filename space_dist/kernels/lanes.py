@@ -18,13 +18,18 @@ from numba.core import cgutils, types
 from numba.core.typing import signature
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import intrinsic as _intrinsic
-from numba.extending import lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, overload, register_model
 
 F = TypeVar("F", bound=Callable[..., Any])
 BYTES = 64
+# Nothing here allocates, and nothing but what is compiled calls it: reference counts and wrappers cost compile time.
+_OPTIONS = {
+    "boundscheck": False, "error_model": "numpy", "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+}  # fmt: skip
+_INLINED = {**_OPTIONS, "forceinline": True}
 
 
-class Lanes(types.Type):  # type: ignore[misc]
+class Lanes(types.Type):
     """Sixteen numbers of float32, or eight of float64."""
 
     def __init__(self, dtype: Any) -> None:
@@ -44,17 +49,28 @@ class _Model(models.PrimitiveModel):  # type: ignore[misc]
 
 def compiled(body: F) -> F:
     """A compiled function that becomes part of every one that calls it."""
-    return cast(F, numba.njit(forceinline=True, boundscheck=False, error_model="numpy")(body))
+    return cast(F, numba.njit(**_INLINED)(body))
 
 
 def function(body: F) -> F:
     """A compiled function of its own, called by compiled functions."""
-    return cast(F, numba.njit(boundscheck=False, error_model="numpy")(body))
+    return cast(F, numba.njit(**_OPTIONS)(body))
 
 
-def intrinsic(typed: F) -> F:
-    """`numba.extending.intrinsic`, typed."""
-    return cast(F, _intrinsic(typed))
+def entry(body: F) -> F:
+    """A compiled function that Python calls."""
+    return cast(F, numba.njit(boundscheck=False, error_model="numpy", _nrt=False)(body))
+
+
+def implementation(function: Callable[..., Any]) -> Callable[[F], F]:
+    """Say what compiled functions take for `function`, by the types of its arguments."""
+    made: Callable[[F], F] = overload(function, strict=False, jit_options=_INLINED)
+    return made
+
+
+def intrinsic(typed: Callable[..., Any]) -> Any:
+    """A function of compiled functions, from what types it and emits its code: without the first argument, `typing`."""
+    return _intrinsic(typed)
 
 
 def _vector(value: ir.Value, lanes: Lanes, builder: ir.IRBuilder) -> ir.Value:
@@ -98,7 +114,7 @@ def _store(builder: ir.IRBuilder, value: ir.Value, pointer: ir.Value, lanes: Lan
 
 
 @intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:  # noqa: ARG001
+def load(typing: Any, array: Any, index: Any) -> Any:
     """The lanes that begin at `array[index]`."""
     lanes = _LANES[array.dtype]
 
@@ -109,7 +125,7 @@ def load(typing: Any, array: Any, index: Any) -> Any:  # noqa: ARG001
 
 
 @intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:  # noqa: ARG001
+def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write lanes from `array[index]` on."""
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -120,7 +136,7 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:  # noqa: ARG0
 
 
 @intrinsic
-def every(typing: Any, like: Any, number: Any) -> Any:  # noqa: ARG001
+def every(typing: Any, like: Any, number: Any) -> Any:
     """`number` in every lane; `like`: lanes or an array of the type wanted."""
     lanes = like if isinstance(like, Lanes) else _LANES[like.dtype]
 
@@ -131,11 +147,11 @@ def every(typing: Any, like: Any, number: Any) -> Any:  # noqa: ARG001
 
 
 @intrinsic
-def width(typing: Any, array: Any) -> Any:  # noqa: ARG001
+def width(typing: Any, array: Any) -> Any:
     """How many numbers of an array are lanes."""
     count = _LANES[array.dtype].count
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return context.get_constant(types.intp, count)
 
     return types.intp(array), code
@@ -151,7 +167,7 @@ def _operation(name: str, function: Any) -> None:
     infer_global(function)(_Template)
     for lanes in _LANES.values():
 
-        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             return getattr(builder, name)(*values)
 
         lower_builtin(function, lanes, lanes)(code)
@@ -164,20 +180,20 @@ for _name, _function in {
 
 
 @intrinsic
-def fma(typing: Any, first: Any, second: Any, third: Any) -> Any:  # noqa: ARG001
+def fma(typing: Any, first: Any, second: Any, third: Any) -> Any:
     """`first * second + third`, rounded once."""
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return _call(builder, "fma", *values)
 
     return first(first, first, first), code
 
 
 @intrinsic
-def root(typing: Any, value: Any) -> Any:  # noqa: ARG001
+def root(typing: Any, value: Any) -> Any:
     """Square roots."""
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return _call(builder, "sqrt", *values)
 
     return value(value), code
@@ -186,7 +202,7 @@ def root(typing: Any, value: Any) -> Any:  # noqa: ARG001
 def polynomial(coefficients: tuple[float, ...]) -> Any:
     """The intrinsic `x -> sum_k coefficients[k] x^k`, by Horner's rule."""
 
-    def typed(typing: Any, x: Any) -> Any:  # noqa: ARG001
+    def typed(typing: Any, x: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             def each(number: float) -> Any:
                 return _vector(context.get_constant(x.dtype, number), x, builder)
@@ -202,8 +218,8 @@ def polynomial(coefficients: tuple[float, ...]) -> Any:
 
 
 def _choice(comparison: str) -> Any:
-    def choose(typing: Any, left: Any, right: Any, then: Any, otherwise: Any) -> Any:  # noqa: ARG001
-        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def choose(typing: Any, left: Any, right: Any, then: Any, otherwise: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             return builder.select(builder.fcmp_ordered(comparison, *values[:2]), *values[2:])
 
         return left(left, left, left, left), code
@@ -218,11 +234,11 @@ where_equal = _choice("==")
 
 
 @intrinsic
-def total(typing: Any, value: Any) -> Any:  # noqa: ARG001
+def total(typing: Any, value: Any) -> Any:
     """The sum of all lanes: halves are added, then halves of that."""
     count, element = value.count, value.dtype
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         found, size = values[0], count
         while size > 1:
             size //= 2
@@ -248,11 +264,11 @@ def _integers(lanes: Lanes) -> tuple[ir.Type, int, int]:
 
 
 @intrinsic
-def scaled(typing: Any, value: Any, shifted: Any) -> Any:  # noqa: ARG001
+def scaled(typing: Any, value: Any, shifted: Any) -> Any:
     """`value` times two to the power that the last bits of `shifted` are; the product must be a normal number."""
     kind, mantissa, _ = _integers(value)
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         power = builder.shl(builder.bitcast(values[1], kind), ir.Constant(kind, [mantissa] * value.count))
         return builder.bitcast(builder.add(builder.bitcast(values[0], kind), power), values[0].type)
 
@@ -260,11 +276,11 @@ def scaled(typing: Any, value: Any, shifted: Any) -> Any:  # noqa: ARG001
 
 
 @intrinsic
-def mantissa(typing: Any, value: Any) -> Any:  # noqa: ARG001
+def mantissa(typing: Any, value: Any) -> Any:
     """Of positive normal numbers, the m in [1, 2) of m * 2^e."""
     kind, size, bias = _integers(value)
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         low = builder.and_(builder.bitcast(values[0], kind), ir.Constant(kind, [(1 << size) - 1] * value.count))
         return builder.bitcast(builder.or_(low, ir.Constant(kind, [bias << size] * value.count)), values[0].type)
 
@@ -272,11 +288,11 @@ def mantissa(typing: Any, value: Any) -> Any:  # noqa: ARG001
 
 
 @intrinsic
-def exponent(typing: Any, value: Any) -> Any:  # noqa: ARG001
+def exponent(typing: Any, value: Any) -> Any:
     """Of positive normal numbers, the e of m * 2^e, as a number."""
     kind, size, bias = _integers(value)
 
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         high = builder.lshr(builder.bitcast(values[0], kind), ir.Constant(kind, [size] * value.count))
         return builder.sitofp(builder.sub(high, ir.Constant(kind, [bias] * value.count)), values[0].type)
 
@@ -300,7 +316,7 @@ def product(rows: int, panels: int) -> Any:
     def typed(
         typing: Any, m: Any, c: Any, c_panel: Any, start: Any, start_row: Any, start_panel: Any,
         a: Any, a_row: Any, a_step: Any, a_jump: Any, span: Any, b: Any, b_panel: Any, count: Any,
-    ) -> Any:  # fmt: skip  # noqa: ARG001
+    ) -> Any:  # fmt: skip
         lanes = _LANES[m.dtype]
 
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -355,7 +371,7 @@ def _variable(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
 
 
 @intrinsic
-def transpose(typing: Any, m: Any, source: Any, target: Any) -> Any:  # noqa: ARG001
+def transpose(typing: Any, m: Any, source: Any, target: Any) -> Any:
     """The L x L numbers from `m[source]` on, rows and columns exchanged, from `m[target]` on."""
     lanes = _LANES[m.dtype]
 

@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -26,8 +24,20 @@ from llvmlite import binding
 from numpy.typing import NDArray
 
 from space_dist.kernels.functions import tanh
-from space_dist.kernels.lanes import BYTES, compiled, every, fma, function, load, product, store, total, transpose
-from space_dist.kernels.lanes import where_greater, width
+from space_dist.kernels.lanes import (
+    BYTES,
+    compiled,
+    every,
+    fma,
+    function,
+    load,
+    product,
+    store,
+    total,
+    transpose,
+    where_greater,
+    width,
+)
 
 ACTOR, CRITIC = 0, 1
 Array = NDArray[np.floating[Any]]
@@ -55,9 +65,10 @@ class Shape:
 class Plan(NamedTuple):
     """Numbers that a compiled function needs; what ends in `_at` is a place in the array.
 
-    rows: of a minibatch, rounded up.  length: of all parameters; gradients lie so far behind them, then Adam's means and
-    squares.  fields: numbers of a sample beside its observation, `fields_at` (fields, rows): the action, and the four
-    below.  shares_at: (rows,) one by a minibatch's size, 0 in rows too many.
+    rows: of a minibatch, rounded up.  length: of all parameters; gradients lie so far behind them, then Adam's means
+    and squares.  fields: numbers of a sample beside its observation, `fields_at` (fields, rows): the action, its
+    log-probability when it was taken, the advantage, the return, and the value of that time.
+    record: numbers of a sample.  shares_at: (rows,) one by a minibatch's size, 0 in rows too many.
     """
 
     depth: int
@@ -96,12 +107,14 @@ class Layout:
     """Where an actor-critic of one shape, and what learning needs beside it, lie in an array.
 
     layers: (2, depth + 1, 7) `Layer`s, the actor's first.  size: of the array.
+    record_at: where a sample's fields begin.
     places: by SB3's names of parameters, (n,) where the numbers of each lie among `Plan.length`.
     """
 
     plan: Plan
     layers: NDArray[np.int64]
     size: int
+    record_at: int
     places: dict[str, NDArray[np.int64]]
 
     @classmethod
@@ -160,7 +173,7 @@ class Layout:
             zeros_at=zeros_at, inputs_at=inputs_at, fields_at=fields_at, shares_at=shares_at,
             turned_at=turned_at, sums_at=sums_at, block_at=block_at,
         )  # fmt: skip
-        return cls(plan, layers, work.taken, places)
+        return cls(plan, layers, work.taken, rounded_up(shape.inputs, lanes), places)
 
 
 class _Places:
@@ -290,7 +303,7 @@ def backward(m: Any, plan: Any, layers: Any, network: int, count: int) -> None:
 
     Hidden units give way to their gradients.
     """
-    _outputs_backward(m, plan, layers, network, count)
+    _outputs_backward(m, plan, layers, network)
     lanes, rows = width(m), plan.rows
     panel = rows * lanes
     for number in range(plan.depth - 1, -1, -1):
@@ -342,7 +355,7 @@ def _sum_of_rows(m: Any, at: int, rows: int) -> Any:
 
 
 @function
-def _outputs_backward(m: Any, plan: Any, layers: Any, network: int, count: int) -> None:
+def _outputs_backward(m: Any, plan: Any, layers: Any, network: int) -> None:
     lanes, rows = width(m), plan.rows
     panel = rows * lanes
     n_in, n_out, weights_at, biases_at, below_at, _, gradient_at = layers[network, plan.depth]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from space_dist.kernels.build import ready
 from space_dist.kernels.functions import exp, log
 from space_dist.kernels.lanes import (
     compiled,
+    entry,
     every,
     fma,
     function,
@@ -21,7 +24,7 @@ from space_dist.kernels.lanes import (
     where_greater,
     width,
 )
-from space_dist.kernels.networks import ACTOR, CRITIC, backward, forward, padded
+from space_dist.kernels.networks import ACTOR, CRITIC, Layout, Shape, backward, forward, padded
 
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 # What a minibatch tells of itself: columns.
@@ -83,7 +86,7 @@ def _normalize(m: Any, plan: Any, count: int) -> None:
 @function
 def _gaussian(m: Any, plan: Any, layers: Any, row: int) -> Any:
     """Log-probabilities of a few rows' actions; their deviations take the gradient's place meanwhile."""
-    lanes, rows = width(m), plan.rows
+    rows = plan.rows
     means_at, deviations_at = layers[ACTOR, plan.depth][5], layers[ACTOR, plan.depth][6]
     squares, volume = every(m, 0.0), 0.0
     for output in range(plan.outputs):
@@ -197,12 +200,13 @@ def _losses(m: Any, plan: Any, layers: Any, settings: Any, told: Any) -> None:
 
 
 @function
-def _norm(m: Any, plan: Any) -> float:
+def _norm(m: Any, plan: Any) -> Any:
     """Of the whole gradient."""
     lanes = width(m)
     one = two = three = four = every(m, 0.0)
     for at in range(plan.length, 2 * plan.length, 4 * lanes):
-        first, second, third, fourth = load(m, at), load(m, at + lanes), load(m, at + 2 * lanes), load(m, at + 3 * lanes)
+        first, second = load(m, at), load(m, at + lanes)
+        third, fourth = load(m, at + 2 * lanes), load(m, at + 3 * lanes)
         one, two = fma(first, first, one), fma(second, second, two)
         three, four = fma(third, third, three), fma(fourth, fourth, four)
     return root(np.float64(total((one + two) + (three + four))))
@@ -241,7 +245,7 @@ def _adam(m: Any, plan: Any, settings: Any, step: int, norm: float) -> None:
         store(m, at, fma(mean / fma(root(square), unbiased, eps), rate, load(m, at)))
 
 
-@function
+@entry
 def update(
     m: Any, plan: Any, layers: Any, settings: Any, samples: Any, orders: Any, size: int, told: Any
 ) -> tuple[int, int, int]:
@@ -273,13 +277,13 @@ def update(
     return done, steps, len(orders)
 
 
-@function
+@entry
 def evaluate(
-    m: Any, plan: Any, layers: Any, samples: Any, n: int, outputs: Any, values: Any, log_probs: Any
+    m: Any, plan: Any, layers: Any, samples: Any, order: Any, outputs: Any, values: Any, log_probs: Any
 ) -> None:
-    """What the networks say of n samples: (n, outputs), (n,), and log-probabilities (n,) of their actions."""
+    """What the networks say of (n,) samples: (n, outputs), (n,), and log-probabilities (n,) of their actions."""
     lanes, rows = width(m), plan.rows
-    order = np.arange(n)
+    n = len(order)
     outputs_at, values_at = layers[ACTOR, plan.depth][5], layers[CRITIC, plan.depth][5]
     for first in range(0, n, rows):
         count = min(rows, n - first)
@@ -297,3 +301,24 @@ def evaluate(
                 outputs[first + row, output] = m[outputs_at + output * rows + row]
             values[first + row] = m[values_at + row]
             log_probs[first + row] = m[plan.shares_at + row]
+
+
+@functools.cache
+def prepare(dtype: Any) -> tuple[Any, Any]:
+    """`update` and `evaluate`, compiled for arrays of `dtype`, which are the only ones they then take."""
+    layout = Layout.of(Shape(1, 1, False, (1,), "tanh"), 1, np.dtype(dtype).itemsize)
+    m, row, rows = np.zeros(1, dtype), np.zeros(1, dtype), np.zeros((1, 1), dtype)
+    orders, told = np.zeros((1, 1), np.int64), np.zeros((1, TOLD))
+    settings = Settings(0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
+    entries: tuple[Any, Any] = update, evaluate
+    for one in entries:
+        one.disable_compile(False)
+    ready(
+        [
+            (update, (m, layout.plan, layout.layers, settings, row, orders, 1, told)),
+            (evaluate, (m, layout.plan, layout.layers, row, orders[0], rows, row, row)),
+        ]
+    )
+    for one in entries:
+        one.disable_compile()
+    return entries

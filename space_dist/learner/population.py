@@ -21,9 +21,10 @@ from stable_baselines3.common.utils import explained_variance
 from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig
 from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.kernels import Shape
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
 from space_dist.learner.on_policy import Joined, OnPolicyLearner, mean_sizes
-from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Shape, Stack, rounded_up
+from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Stack, rounded_up
 from space_dist.learner.trust_region import TRPO, TRPOSettings
 from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
