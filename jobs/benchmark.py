@@ -5,7 +5,7 @@ from __future__ import annotations
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
 import typer
-from benchmarks import chaos, checkpoint, curricula, curriculum, envs, equivalence, grid, throughput
+from benchmarks import chaos, checkpoint, curricula, curriculum, envs, equivalence, grid, kernel, throughput
 from rich.console import Console
 
 from space_dist.errors import SpaceDistError
@@ -19,6 +19,7 @@ for _benchmark in (
     envs.envs,
     equivalence.equivalence,
     grid.grid,
+    kernel.kernel,
     throughput.throughput,
 ):
     app.command()(_benchmark)

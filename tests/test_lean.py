@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from space_dist import config as configs
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
-from space_dist.kernels.ppo import NORM
+from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
 from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
@@ -189,6 +189,20 @@ def test_single_precision_is_as_near_to_double_as_stable_baselines3s(env_id: str
 def vector(learner: Any) -> NDArray[np.float64]:
     """All weights in a row."""
     return np.concatenate([array.ravel() for array in learner.scored().values()]).astype(np.float64)
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+def test_the_policy_that_acted_is_its_own_to_the_bit(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, told = learner_for(small(update="lean", batch_size=19), env_id), []
+    lean_update = lean.Network.update
+
+    def watched(self: Any, *arguments: Any) -> lean.Report:
+        told.append(lean_update(self, *arguments).told)
+        return lean.Report(told[-1], 4, 0)
+
+    monkeypatch.setattr(lean.Network, "update", watched)
+    update(learner, 0, env_id)
+    assert told[0][0, DIVERGENCE] == told[0][0, CLIPPED] == 0.0 < told[0][1, DIVERGENCE]
 
 
 # ---- what it shares with stock ----

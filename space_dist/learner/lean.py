@@ -23,7 +23,7 @@ from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
 from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, ENTROPY, POLICY_LOSS, TOLD, VALUE_LOSS
 
 Array = NDArray[np.floating[Any]]
-_ROWS = 512  # samples that are evaluated together, at most: more find no room in the cache
+_ROWS = 64  # samples that are evaluated together; no result depends on it
 
 
 class LeanPPO(PPO):
@@ -45,11 +45,10 @@ class LeanPPO(PPO):
         for name, value in self._metrics(report).items():
             self.logger.record(f"train/{name}", value)
 
-    def evaluate(self, observations: Array, actions: NDArray[Any]) -> tuple[Array, Array]:
-        """`(n, inputs), (n, ...) -> (n,), (n,)` values and log-probabilities, as an update computes them."""
+    def evaluate(self, observations: Array, actions: NDArray[Any] | None = None) -> tuple[Array, Array]:
+        """`(n, inputs), (n, ...) -> (n,), (n,)` values and actions' log-probabilities, to the bit as an update's."""
         network = Network(self.policy)
-        _, values, log_probs = network.evaluate(network.packed(observations, actions))
-        return values, log_probs
+        return network.evaluate(network.packed(observations, np.zeros(()) if actions is None else actions))
 
     def _settings(self) -> Settings:
         (group,) = self.policy.optimizer.param_groups
@@ -117,7 +116,7 @@ class Network:
         samples = np.zeros((n, layout.plan.record), dtype=self._dtype)
         samples[:, : layout.plan.inputs] = observations.reshape(n, -1)
         count = layout.plan.fields - 4
-        samples[:, first : first + count] = actions.reshape(n, -1)
+        samples[:, first : first + count] = actions.reshape(n, -1) if actions.ndim else actions
         for offset, numbers in enumerate((log_probs, advantages, returns, values)):
             samples[:, first + count + offset] = numbers.reshape(-1) if isinstance(numbers, np.ndarray) else numbers
         return samples
@@ -157,17 +156,17 @@ class Network:
                 "step": torch.tensor(float(steps)), "exp_avg": mean, "exp_avg_sq": square,
             }  # fmt: skip
 
-    def evaluate(self, samples: Array) -> tuple[Array, Array, Array]:
-        """`(n, record) -> (n, outputs), (n,), (n,)`: the actor's outputs, values, and actions' log-probabilities."""
+    def evaluate(self, samples: Array) -> tuple[Array, Array]:
+        """`(n, record) -> (n,), (n,)`: values, and the actions' log-probabilities."""
         n = len(samples)
-        layout = self._layout(max(1, min(_ROWS, n)))
+        layout = self._layout(_ROWS)
         m = aligned(layout.size, self._dtype)
         for name, parameter in self._parameters.items():
             m[layout.places[name]] = parameter.detach().numpy().ravel()
         found = np.zeros((n, layout.plan.outputs), self._dtype), np.zeros(n, self._dtype), np.zeros(n, self._dtype)
         _, evaluate = prepare(self._dtype)
         evaluate(m, layout.plan, layout.layers, samples.ravel(), np.arange(n), *found)
-        return found
+        return found[1:]
 
     def _layout(self, rows: int) -> Layout:
         return Layout.of(self._shape, rows, self._dtype.itemsize)

@@ -39,7 +39,7 @@ class Joined:
 
 
 class OnPolicyLearner(Learner):
-    """A learner whose advantages, returns and losses are SB3's own, on our shards."""
+    """A learner whose advantages, returns and losses are SB3's own, on our shards; or `lean`'s."""
 
     model: OnPolicyAlgorithm
 
@@ -114,7 +114,7 @@ class OnPolicyLearner(Learner):
         As in SB3's own collecting, the value behind a truncated step is added to its reward, and an episode still
         running at the end is bootstrapped from the value of its last observation.
         """
-        policy, buffer, joined = self.model.policy, self.model.rollout_buffer, self.joined(shards)
+        buffer, joined = self.model.rollout_buffer, self.joined(shards)
         observations, actions, rewards, ended = joined.observations, joined.actions, joined.rewards, joined.ended
         length, n_slots = rewards.shape
         with torch.no_grad():
@@ -122,7 +122,7 @@ class OnPolicyLearner(Learner):
             flat_actions = torch.as_tensor(actions.reshape(length * n_slots, -1).astype(np.float32))
             if isinstance(self.model.action_space, spaces.Discrete):
                 flat_actions = flat_actions.long().flatten()
-            values, log_probs, _ = policy.evaluate_actions(tensors(flat), flat_actions)
+            values, log_probs = self._evaluated(flat, flat_actions)
             first = 0
             for shard in shards:
                 if rows(shard.truncated_observations):
@@ -155,8 +155,18 @@ class OnPolicyLearner(Learner):
 
     def _values(self, observations: Observations) -> NDArray[np.float32]:
         scaled = self.statistics.scaled(observations)
+        if isinstance(self.model, LeanPPO) and not isinstance(scaled, dict):
+            return self.model.evaluate(scaled)[0][:, None]
         values: NDArray[np.float32] = self.model.policy.predict_values(tensors(scaled)).numpy()
         return values
+
+    def _evaluated(self, observations: Observations, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """`(n,), (n,)` values, and log-probabilities of (n, ...) actions, as the update that follows computes them."""
+        if isinstance(self.model, LeanPPO) and not isinstance(observations, dict):
+            values, log_probs = self.model.evaluate(observations, actions.numpy())
+            return torch.from_numpy(values), torch.from_numpy(log_probs)
+        found, likelihoods, _ = self.model.policy.evaluate_actions(tensors(observations), actions)
+        return found, likelihoods
 
 
 def mean_sizes(shards: Sequence[Shard], numbers: NDArray[np.float32]) -> NDArray[np.float64]:
