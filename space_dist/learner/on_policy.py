@@ -63,8 +63,7 @@ class OnPolicyLearner(Learner):
         settings = {name: value for name, value in dict(config).items() if name not in _OURS}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
             settings["max_grad_norm"] = float("inf")
-        lean = isinstance(config, PPOConfig) and config.update == "lean"
-        algorithm: Any = LeanPPO if lean else ALGORITHMS[config.kind]
+        algorithm: Any = LeanPPO if self._compiled else ALGORITHMS[config.kind]
         model = algorithm(
             policy_class(config),
             env=None,
@@ -79,6 +78,11 @@ class OnPolicyLearner(Learner):
         model._setup_model()
         on_policy: OnPolicyAlgorithm = model
         return on_policy
+
+    @property
+    def _compiled(self) -> bool:
+        """Whether updates, and what they need, are computed by our kernel."""
+        return isinstance(self._settings, PPOConfig) and self._settings.update == "lean"
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         return {"policy": self.model.policy.optimizer}
