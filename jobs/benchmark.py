@@ -15,6 +15,7 @@ from benchmarks import (
     envs,
     equivalence,
     grid,
+    kernel,
     pic,
     throughput,
 )
@@ -33,6 +34,7 @@ for _benchmark in (
     envs.envs,
     equivalence.equivalence,
     grid.grid,
+    kernel.kernel,
     pic.pic,
     throughput.throughput,
 ):

@@ -485,8 +485,9 @@ class PPOConfig(_OnPolicy):
     target_kl: float | None = Field(default=None, gt=0.0)
     """Stop an update's epochs early at 1.5 times this divergence; null: never. Source: SB3."""
     update: Literal["stock", "lean"] = "stock"
-    """stock: SB3's own train(). lean: the same minibatches, loss and optimiser with derivatives written out, several
-    times faster where networks are small, equal but for rounding; MlpPolicy only. Part of what a run is."""
+    """stock: SB3's own train(). lean: the same minibatches, loss and optimiser in one compiled function, many times
+    faster where networks are small, equal but for rounding, and with the same bits on every CPU; MlpPolicy only. Part
+    of what a run is."""
 
     @model_validator(mode="after")
     def _lean_knows_mlps_only(self) -> Self:
@@ -741,7 +742,8 @@ class RunConfig(Section):
     """The one number from which every random number of the run comes."""
     engine: Literal["auto", "single", "population"] = "single"
     """How updates are computed. single: by SB3 itself. population: the same losses for many runs of one shape at once
-    (PPO and TRPO with MlpPolicy); a grid puts such runs together, and one alone has the same bits. auto: population
+    (PPO, as with learner.update: lean, and TRPO, with MlpPolicy); a grid puts such runs together, and one alone has the
+    same bits. auto: population
     where the learner allows it; decided when a grid is frozen or a run begins. Part of what a run is."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where updates are computed; cuda: a GPU, with engine: population, where up to 1,024 runs share a process. A

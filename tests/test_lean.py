@@ -17,6 +17,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from space_dist import config as configs
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
+from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
 from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
@@ -46,36 +47,41 @@ def doubled(learner: Any) -> Any:
 
 
 class Seen:
-    """The norms before clipping and the gradients after it, one entry per minibatch; all parameters in one row."""
+    """The norms before clipping, one entry per minibatch, and the last one's gradient after it in one row."""
 
     def __init__(self) -> None:
         self.norms: list[float] = []
-        self.gradients: list[NDArray[Any]] = []
+        self.gradient: NDArray[Any] = np.zeros(0)
+        self.stopped = False
 
 
 @contextmanager
 def recorded(learner: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
     """What an update clips, be it stock or lean."""
     seen, policy = Seen(), learner.model.policy
-    stock_clip, lean_clip = torch.nn.utils.clip_grad_norm_, lean.clip_norm
+    stock_clip, lean_update, lean_keep = torch.nn.utils.clip_grad_norm_, lean.Network.update, lean.Network._keep
 
     def stock(parameters: Any, largest: float) -> torch.Tensor:
         norm = stock_clip(parameters, largest)
         seen.norms.append(float(norm))
-        seen.gradients.append(np.concatenate([parameter.grad.numpy().ravel() for parameter in policy.parameters()]))
+        seen.gradient = np.concatenate([parameter.grad.numpy().ravel() for parameter in policy.parameters()])
         return norm
 
-    def ours(gradient: torch.Tensor, largest: float) -> float:
-        norm = lean_clip(gradient, largest)
-        seen.norms.append(norm)
-        parameters = lean._parameters(policy)
-        parts = dict(zip(parameters, lean._parts(gradient, parameters), strict=True))
-        seen.gradients.append(np.concatenate([parts[parameter].numpy().ravel() for parameter in policy.parameters()]))
-        return norm
+    def ours(self: Any, *arguments: Any) -> lean.Report:
+        report = lean_update(self, *arguments)
+        seen.norms.extend(norm for norm in report.told[:, NORM] if norm)
+        seen.stopped = report.told[-1, NORM] == 0.0
+        seen.gradient = seen.gradient * min(1.0, learner.model.max_grad_norm / (seen.norms[-1] + 1e-6))
+        return report
+
+    def keep(self: Any, layout: Any, parts: Any, steps: int) -> None:
+        seen.gradient = np.concatenate([parts[1][layout.places[name]] for name, _ in policy.named_parameters()])
+        lean_keep(self, layout, parts, steps)
 
     with monkeypatch.context() as patched:
         patched.setattr(torch.nn.utils, "clip_grad_norm_", stock)
-        patched.setattr(lean, "clip_norm", ours)
+        patched.setattr(lean.Network, "update", ours)
+        patched.setattr(lean.Network, "_keep", keep)
         yield seen
 
 
@@ -85,8 +91,10 @@ def state(learner: Any) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def pair(env_id: str, *, double: bool, **changes: Any) -> tuple[Any, Any]:
+def pair(env_id: str, *, double: bool, clip_range_vf: float | None = None, **changes: Any) -> tuple[Any, Any]:
     learners = [learner_for(small(**changes, update=kind), env_id) for kind in ("stock", "lean")]
+    for learner in learners:
+        learner.model.clip_range_vf = None if clip_range_vf is None else lambda _: clip_range_vf
     assert isinstance(learners[1].model, lean.LeanPPO)
     assert not isinstance(learners[0].model, lean.LeanPPO)
     if double:
@@ -111,7 +119,8 @@ def compare(
         close(list(done[1].metrics.values()), list(done[0].metrics.values()), tolerance, str(list(done[0].metrics)))
         close(done[1].advantages, done[0].advantages, tolerance, "advantages")
         close(seen[1].norms, seen[0].norms, tolerance, "norms")
-        close(seen[1].gradients, seen[0].gradients, tolerance, "gradients")
+        if not seen[1].stopped:  # a minibatch that makes no step has no gradient
+            close(seen[1].gradient, seen[0].gradient, tolerance, "gradient")
         expected, got = state(stock), state(ours)
         assert got.keys() == expected.keys()
         for name, array in expected.items():
@@ -136,6 +145,9 @@ CASES: dict[str, dict[str, Any]] = {
     "a smaller last minibatch": {"batch_size": 36},
     "a last minibatch of one": {"batch_size": 19},
     "one minibatch": {"batch_size": 1000, "normalize_advantage": False},
+    "three odd hidden layers": {"net_arch": (33, 5, 17), "batch_size": 41},
+    "wider than one panel": {"net_arch": (40, 72), "activation": "relu", "n_epochs": 1},
+    "values clipped": {"clip_range_vf": 0.05, "learning_rate": 3e-3},
     "scaled": {"normalize_observations": True, "normalize_rewards": True, "learning_rate_schedule": "linear"},
 }
 
@@ -177,6 +189,20 @@ def test_single_precision_is_as_near_to_double_as_stable_baselines3s(env_id: str
 def vector(learner: Any) -> NDArray[np.float64]:
     """All weights in a row."""
     return np.concatenate([array.ravel() for array in learner.scored().values()]).astype(np.float64)
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
+def test_the_policy_that_acted_is_its_own_to_the_bit(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, told = learner_for(small(update="lean", batch_size=19), env_id), []
+    lean_update = lean.Network.update
+
+    def watched(self: Any, *arguments: Any) -> lean.Report:
+        told.append(lean_update(self, *arguments).told)
+        return lean.Report(told[-1], 4, 0)
+
+    monkeypatch.setattr(lean.Network, "update", watched)
+    update(learner, 0, env_id)
+    assert told[0][0, DIVERGENCE] == told[0][0, CLIPPED] == 0.0 < told[0][1, DIVERGENCE]
 
 
 # ---- what it shares with stock ----

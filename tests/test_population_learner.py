@@ -60,6 +60,11 @@ def member(config: LearnerConfig, env_id: str = LINE, *, seed: int = 0, updates:
     )  # fmt: skip
 
 
+def stacked(config: LearnerConfig, env_id: str = LINE, **more: Any) -> Any:
+    """A member whose updates are made in a stack, also where there is a faster way."""
+    return member(config, env_id, stacked=True, **more)
+
+
 class Doubled(FlattenExtractor):
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         return super().forward(observations).double()
@@ -164,7 +169,7 @@ def test_every_member_learns_what_stable_baselines3_does(
     shared = {"activation": activation, "net_arch": net_arch, "batch_size": 40, **passes}
     configs = [small(kind, **(shared | own)) for own in OWN[kind]]
     more = {"dtype": torch.float64, "device": device, "updates": updates}
-    members = [member(config, env_id, seed=seed, **more) for seed, config in enumerate(configs)]
+    members = [stacked(config, env_id, seed=seed, **more) for seed, config in enumerate(configs)]
     references = [
         doubled(learner_for(config, env_id, seed=seed, updates=updates), env_id) for seed, config in enumerate(configs)
     ]
@@ -217,28 +222,32 @@ def bits(learner: Any) -> dict[str, bytes]:
 
 
 def company(
-    kind: str, env_id: str, net_arch: tuple[int, ...], batch_size: int
+    kind: str, env_id: str, net_arch: tuple[int, ...], batch_size: int, way: Any
 ) -> Iterator[tuple[Any, list[list[Shard]]]]:
     """Twenty members of one shape with what each learns from in two updates; one of them will diverge."""
     for index in range(20):
         own = {"learning_rate": 1e30} if index == 7 else OWN[kind][index % 5]
         config = small(kind, **({"net_arch": net_arch, "batch_size": batch_size} | own))
-        learner = member(config, env_id, seed=index)
+        learner = way(config, env_id, seed=index)
         yield learner, [shards_of(learner, env_id, round=number) for number in range(2)]
 
 
 @pytest.mark.parametrize(
-    ("kind", "env_id", "net_arch", "batch_size"),
+    ("kind", "env_id", "net_arch", "batch_size", "way"),
     [
-        ("ppo", LINE, (8,), 32),
-        ("ppo", LINE, (13, 7), 23),
-        ("ppo", DISCRETE_LINE, (5, 16), 32),
-        ("trpo", LINE, (13, 7), 23),
-        ("trpo", DISCRETE_LINE, (5, 16), 32),
+        ("ppo", LINE, (8,), 32, stacked),
+        ("ppo", LINE, (13, 7), 23, stacked),
+        ("ppo", LINE, (13, 7), 23, member),
+        ("ppo", DISCRETE_LINE, (5, 16), 32, stacked),
+        ("ppo", DISCRETE_LINE, (5, 16), 32, member),
+        ("trpo", LINE, (13, 7), 23, member),
+        ("trpo", DISCRETE_LINE, (5, 16), 32, member),
     ],
 )
-def test_companions_decide_nothing(kind: str, env_id: str, net_arch: tuple[int, ...], batch_size: int) -> None:
-    everybody = list(company(kind, env_id, net_arch, batch_size))
+def test_companions_decide_nothing(
+    kind: str, env_id: str, net_arch: tuple[int, ...], batch_size: int, way: Any
+) -> None:
+    everybody = list(company(kind, env_id, net_arch, batch_size, way))
     start = [learner.save() for learner, _ in everybody]
     alone: dict[int, Any] = {}
 
@@ -294,6 +303,18 @@ def test_companions_decide_little_on_cuda(kind: str) -> None:
     for other in found[1:]:
         for name, array in found[0].items():
             np.testing.assert_allclose(other[name], array, atol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE])
+def test_on_a_cpu_ppo_learns_what_a_lean_run_does_to_the_bit(env_id: str) -> None:
+    ours, alone = member(small(), env_id), learner_for(small(update="lean"), env_id)
+    for number in range(2):
+        shards = shards_of(ours, env_id, round=number)
+        done, expected = (one.update(shards, round=number, steps=(number + 1) * STEPS) for one in (ours, alone))
+        assert done.metrics == expected.metrics
+    assert bits(ours) == bits(alone)
+    assert member(small("trpo")).stacked
+    assert stacked(small()).key != ours.key
 
 
 # ---- a member by itself ----

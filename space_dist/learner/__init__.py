@@ -2,8 +2,8 @@
 
 Nothing of SB3 is written twice: what shards collected is put into SB3's own buffers, and SB3's own `train()` learns
 from it. What SB3 does outside `train()` while it collects is done here, per transition. The exceptions, both on request
-and held against SB3's in tests, are `lean` (PPO's `train()` for small networks) and `population` with `stacked` and
-`trust_region` (PPO's and sb3-contrib's TRPO's, for many runs at once).
+and held against SB3's in tests, are `lean` (PPO's `train()` as a compiled function, from `kernels`) and `population`
+with `stacked` and `trust_region` (PPO's on GPUs and sb3-contrib's TRPO's, for many runs at once).
 """
 
 from __future__ import annotations

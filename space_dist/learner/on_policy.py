@@ -43,7 +43,7 @@ class Joined:
 
 
 class OnPolicyLearner(Learner):
-    """A learner whose advantages, returns and losses are SB3's own, on our shards."""
+    """A learner whose advantages, returns and losses are SB3's own, on our shards; or `lean`'s."""
 
     model: OnPolicyAlgorithm
 
@@ -67,8 +67,7 @@ class OnPolicyLearner(Learner):
         settings = {name: value for name, value in dict(config).items() if name not in _OURS}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
             settings["max_grad_norm"] = float("inf")
-        lean = isinstance(config, PPOConfig) and config.update == "lean"
-        algorithm: Any = LeanPPO if lean else ALGORITHMS[config.kind]
+        algorithm: Any = LeanPPO if self._compiled else ALGORITHMS[config.kind]
         model = algorithm(
             policy_class(config),
             env=None,
@@ -83,6 +82,11 @@ class OnPolicyLearner(Learner):
         model._setup_model()
         on_policy: OnPolicyAlgorithm = model
         return on_policy
+
+    @property
+    def _compiled(self) -> bool:
+        """Whether updates, and what they need, are computed by our kernel."""
+        return isinstance(self._settings, PPOConfig) and self._settings.update == "lean"
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         return {"policy": self.model.policy.optimizer}
@@ -118,7 +122,7 @@ class OnPolicyLearner(Learner):
         As in SB3's own collecting, the value behind a truncated step is added to its reward, and an episode that goes
         on is bootstrapped from the value of its last observation.
         """
-        policy, buffer, joined = self.model.policy, self.model.rollout_buffer, self.joined(shards)
+        buffer, joined = self.model.rollout_buffer, self.joined(shards)
         observations, actions, rewards, ended = joined.observations, joined.actions, joined.rewards, joined.ended
         length, n_slots = rewards.shape
         with torch.no_grad():
@@ -126,7 +130,7 @@ class OnPolicyLearner(Learner):
             flat_actions = torch.as_tensor(actions.reshape(length * n_slots, -1).astype(np.float32))
             if isinstance(self.model.action_space, spaces.Discrete):
                 flat_actions = flat_actions.long().flatten()
-            values, log_probs, _ = policy.evaluate_actions(tensors(flat), flat_actions)
+            values, log_probs = self._evaluated(flat, flat_actions)
             first = 0
             for shard in shards:
                 if rows(shard.truncated_observations):
@@ -160,5 +164,15 @@ class OnPolicyLearner(Learner):
 
     def _values(self, observations: Observations) -> NDArray[np.float32]:
         scaled = self.statistics.scaled(observations)
+        if isinstance(self.model, LeanPPO) and not isinstance(scaled, dict):
+            return self.model.evaluate(scaled)[0][:, None]
         values: NDArray[np.float32] = self.model.policy.predict_values(tensors(scaled)).numpy()
         return values
+
+    def _evaluated(self, observations: Observations, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """`(n,), (n,)` values, and log-probabilities of (n, ...) actions, as the update that follows computes them."""
+        if isinstance(self.model, LeanPPO) and not isinstance(observations, dict):
+            values, log_probs = self.model.evaluate(observations, actions.numpy())
+            return torch.from_numpy(values), torch.from_numpy(log_probs)
+        found, likelihoods, _ = self.model.policy.evaluate_actions(tensors(observations), actions)
+        return found, likelihoods

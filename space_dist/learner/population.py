@@ -1,8 +1,9 @@
-"""The population engine: learners of one shape whose updates are computed together, in one tensor program.
+"""The population engine: learners of one shape whose updates are computed together.
 
-Each learner owns its weights and its Adam state, in Stable-Baselines3's own objects, as if it were alone: a checkpoint
-cannot tell which engine wrote it, and a learner may be updated with others every time. For one update their parameters
-are copied into a stack (`stacked`) and back, which takes a few of the milliseconds that it lasts.
+On a CPU PPO's are compiled (`lean`), and made one after the other; TRPO's, and all on a GPU, are one tensor program
+(`stacked`). Each learner owns its weights and its Adam state, in Stable-Baselines3's own objects, as if it were alone:
+a checkpoint cannot tell which engine wrote it, and a learner may be updated with others every time. For one update
+parameters are copied, which takes a few of the milliseconds that it lasts.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from stable_baselines3.common.utils import explained_variance
 from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig
 from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.kernels import Shape
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
 from space_dist.learner.on_policy import Joined, OnPolicyLearner
-from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Shape, Stack, rounded_up
+from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Stack, rounded_up
 from space_dist.learner.trust_region import TRPO, TRPOSettings
 from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
@@ -55,10 +57,11 @@ class _Round:
 
 
 class PopulationLearner(OnPolicyLearner):
-    """A member of a population: SB3's networks and optimiser, updated in a stack with others.
+    """A member of a population: SB3's networks and optimiser, updated together with others.
 
     dtype: of weights and arithmetic; as in SB3's buffer, what it learns from is float32 in any case.
-    device: where updates are computed. key: equal for learners that can be updated together.
+    device: where updates are computed. stacked: whether in a stack; None: unless it is PPO on a CPU, where the compiled
+    update is faster at every size that was measured. key: equal for learners that can be updated together.
     """
 
     def __init__(
@@ -73,9 +76,12 @@ class PopulationLearner(OnPolicyLearner):
         total_steps: int,
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
+        stacked: bool | None = None,
     ) -> None:
         torch.set_num_threads(1)  # 1 and 2 threads give different gradients
         refuse(config, observation_space, action_space)
+        compilable = isinstance(config, PPOConfig) and device == "cpu"
+        self.stacked = not compilable if stacked is None else stacked
         super().__init__(
             config, observation_space, action_space,
             seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
@@ -83,7 +89,11 @@ class PopulationLearner(OnPolicyLearner):
         self.model.policy.to(dtype)
         self.settings, self.seed, self.dtype, self.device = config, seed, dtype, torch.device(device)
         self.shape = _shape(config, observation_space, action_space)
-        self.key = (stack_key(config, observation_space, action_space), dtype, device)
+        self.key = (stack_key(config, observation_space, action_space), dtype, device, self.stacked)
+
+    @property
+    def _compiled(self) -> bool:
+        return not self.stacked
 
     def update(
         self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
@@ -205,6 +215,11 @@ def learn_together(
     """
     if len({learner.key for learner in learners}) != 1:
         raise RuntimeError(f"learners of different shapes cannot learn together: {[one.key for one in learners]}")
+    if not learners[0].stacked:
+        return [
+            _alone(learner, shards, at, reached)
+            for learner, shards, at, reached in zip(learners, rounds, round, steps, strict=True)
+        ]
     for shards in rounds:
         require_order(shards)
     # One alone is its own companion: matrices that are not stacked may be multiplied in another way.
@@ -232,6 +247,13 @@ def learn_together(
         else divergence(round[member], NOT_A_NUMBER)
         for member, learner in enumerate(learners)
     ]
+
+
+def _alone(learner: PopulationLearner, shards: Sequence[Shard], round: int, steps: int) -> Update | SpaceDistError:
+    try:
+        return OnPolicyLearner.update(learner, shards, round=round, steps=steps)
+    except SpaceDistError as error:
+        return error
 
 
 def _ppo(config: PPOConfig, learning_rate: float) -> PPOSettings:

@@ -24,36 +24,19 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
+from space_dist.kernels import Shape
 
 ROWS = 32  # a multiple of twice any CPU's vector of float32
 ACTOR, CRITIC = 0, 1
 BETAS, EPS = (0.9, 0.999), 1e-5  # Adam's, in SB3's actor-critic policies
 Array = NDArray[np.floating[Any]]
 LOG_2PI = math.log(2.0 * math.pi)
-
-
-@dataclass(frozen=True)
-class Shape:
-    """What the networks of all members of a stack have in common.
-
-    inputs: of an observation.  outputs: action dimensions, or discrete actions.  hidden: units of each hidden layer.
-    """
-
-    inputs: int
-    outputs: int
-    discrete: bool
-    hidden: tuple[int, ...]
-    activation: Literal["tanh", "relu"]
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Units of each layer, the inputs first."""
-        return (self.inputs, *self.hidden, self.outputs)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,9 @@
+"""Compiled arithmetic with bits of its own: the same on every CPU, whatever its vectors (`lanes` says why).
+
+`ppo` is PPO's whole update of one actor-critic, and its passes forward alone; `networks` says where its numbers lie.
+"""
+
+from space_dist.kernels.networks import Layout, Shape, aligned
+from space_dist.kernels.ppo import Settings, prepare
+
+__all__ = ["Layout", "Settings", "Shape", "aligned", "prepare"]

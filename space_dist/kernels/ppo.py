@@ -1,0 +1,324 @@
+"""The whole update of PPO, as Stable-Baselines3's `PPO.train` makes it, in one compiled function."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from space_dist.kernels.build import ready
+from space_dist.kernels.functions import exp, log
+from space_dist.kernels.lanes import (
+    compiled,
+    entry,
+    every,
+    fma,
+    function,
+    load,
+    root,
+    store,
+    total,
+    where_equal,
+    where_greater,
+    width,
+)
+from space_dist.kernels.networks import ACTOR, CRITIC, Layout, Shape, backward, forward, padded
+
+_HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
+# What a minibatch tells of itself: columns.
+POLICY_LOSS, VALUE_LOSS, ENTROPY, DIVERGENCE, CLIPPED, NORM = range(6)
+TOLD = 6
+
+
+class Settings(NamedTuple):
+    """PPO's and Adam's. clip_range_vf, max_grad_norm, target_kl: infinite for none. steps: that Adam has made."""
+
+    learning_rate: float
+    beta: float
+    beta_square: float
+    eps: float
+    steps: int
+    clip_range: float
+    clip_range_vf: float
+    ent_coef: float
+    vf_coef: float
+    max_grad_norm: float
+    target_kl: float
+    normalize_advantage: bool
+
+
+@function
+def _gather(m: Any, plan: Any, samples: Any, order: Any, first: int, count: int) -> None:
+    """Inputs and fields of `count` samples; nothing in the rows too many."""
+    lanes, rows = width(m), plan.rows
+    inputs, share = padded(plan.inputs, lanes), 1.0 / count
+    for row in range(rows):
+        sample = order[first + row] * plan.record if row < count else 0
+        for part in range(inputs // lanes):
+            at = plan.inputs_at + (part * rows + row) * lanes
+            store(m, at, load(samples, sample + part * lanes) if row < count else every(m, 0.0))
+        for field in range(plan.fields):
+            m[plan.fields_at + field * rows + row] = samples[sample + inputs + field] if row < count else 0.0
+        m[plan.shares_at + row] = share if row < count else 0.0
+
+
+@function
+def _normalize(m: Any, plan: Any, count: int) -> None:
+    """Advantages with mean 0 and standard deviation 1."""
+    lanes, rows, zero = width(m), plan.rows, every(m, 0.0)
+    at = plan.fields_at + (plan.fields - 3) * rows
+    found = zero
+    for row in range(0, rows, lanes):
+        found = found + load(m, at + row)
+    mean = every(m, total(found) / count)
+    found = zero
+    for row in range(0, rows, lanes):
+        away = where_greater(load(m, plan.shares_at + row), zero, load(m, at + row) - mean, zero)
+        store(m, at + row, away)
+        found = fma(away, away, found)
+    scale = every(m, root(np.float64(total(found)) / (count - 1)) + 1e-8)
+    for row in range(0, rows, lanes):
+        store(m, at + row, load(m, at + row) / scale)
+
+
+@function
+def _gaussian(m: Any, plan: Any, layers: Any, row: int) -> Any:
+    """Log-probabilities of a few rows' actions; their deviations take the gradient's place meanwhile."""
+    rows = plan.rows
+    means_at, deviations_at = layers[ACTOR, plan.depth][5], layers[ACTOR, plan.depth][6]
+    squares, volume = every(m, 0.0), 0.0
+    for output in range(plan.outputs):
+        log_std = m[plan.log_std_at + output]
+        scale = exp(every(m, -log_std))
+        at = output * rows + row
+        deviation = (load(m, plan.fields_at + at) - load(m, means_at + at)) * scale
+        store(m, deviations_at + at, deviation)
+        squares = fma(deviation, deviation, squares)
+        volume += log_std
+    volume += plan.outputs * _HALF_LOG_2_PI
+    return fma(squares, every(m, -0.5), every(m, -volume)), every(m, volume + 0.5 * plan.outputs)
+
+
+@function
+def _gaussian_backward(m: Any, plan: Any, layers: Any, row: int, by: Any, bonus: Any) -> None:
+    """Gradients of the means, and of log standard deviations in the same place as far as they are summed up."""
+    rows, deviations_at = plan.rows, layers[ACTOR, plan.depth][6]
+    for output in range(plan.outputs):
+        at = deviations_at + output * rows + row
+        deviation = load(m, at)
+        here = plan.length + plan.log_std_at + output
+        m[here] += total(fma(by * deviation, deviation, every(m, 0.0) - by - bonus))
+        store(m, at, by * deviation * exp(every(m, -m[plan.log_std_at + output])))
+
+
+@function
+def _categorical(m: Any, plan: Any, layers: Any, row: int) -> Any:
+    """Log-probabilities of a few rows' actions, and entropies; all log-probabilities take the gradient's place."""
+    rows = plan.rows
+    logits_at, logs_at = layers[ACTOR, plan.depth][5] + row, layers[ACTOR, plan.depth][6] + row
+    largest = load(m, logits_at)
+    for output in range(1, plan.outputs):
+        logit = load(m, logits_at + output * rows)
+        largest = where_greater(logit, largest, logit, largest)
+    sums = every(m, 0.0)
+    for output in range(plan.outputs):
+        sums = sums + exp(load(m, logits_at + output * rows) - largest)
+    logarithm, actions = log(sums), load(m, plan.fields_at + row)
+    found = entropies = every(m, 0.0)
+    for output in range(plan.outputs):
+        one = load(m, logits_at + output * rows) - largest - logarithm
+        store(m, logs_at + output * rows, one)
+        entropies = entropies - exp(one) * one
+        found = where_equal(actions, every(m, output), one, found)
+    return found, entropies
+
+
+@function
+def _categorical_backward(m: Any, plan: Any, layers: Any, row: int, by: Any, bonus: Any, entropies: Any) -> None:
+    rows, logs_at = plan.rows, layers[ACTOR, plan.depth][6] + row
+    actions, zero = load(m, plan.fields_at + row), every(m, 0.0)
+    for output in range(plan.outputs):
+        one = load(m, logs_at + output * rows)
+        taken = where_equal(actions, every(m, output), by, zero)
+        found = exp(one) * ((one + entropies) * bonus - by) + taken
+        store(m, logs_at + output * rows, found)
+
+
+@function
+def _losses(m: Any, plan: Any, layers: Any, settings: Any, told: Any) -> None:
+    """Losses of a minibatch, into `told`, and the gradients of the networks' outputs."""
+    lanes, rows, fields = width(m), plan.rows, plan.fields_at + (plan.fields - 4) * plan.rows
+    zero, one = every(m, 0.0), every(m, 1.0)
+    low, high = every(m, 1.0 - settings.clip_range), every(m, 1.0 + settings.clip_range)
+    values_at, by_values_at = layers[CRITIC, plan.depth][5], layers[CRITIC, plan.depth][6]
+    if not plan.discrete:
+        for output in range(plan.outputs):
+            m[plan.length + plan.log_std_at + output] = 0.0
+    policy = squares = entropy = divergence = clips = zero
+    for row in range(0, rows, lanes):
+        share = load(m, plan.shares_at + row)
+        if plan.discrete:
+            log_probs, entropies = _categorical(m, plan, layers, row)
+        else:
+            log_probs, entropies = _gaussian(m, plan, layers, row)
+        log_ratios = where_greater(share, zero, log_probs - load(m, fields + row), zero)
+        ratios = exp(log_ratios)
+        gains = (zero - load(m, fields + rows + row)) * share
+        within = where_greater(ratios, high, high, ratios)
+        within = where_greater(low, within, low, within)
+        unclipped, clipped = gains * ratios, gains * within
+        # The larger loss counts, and has a gradient where it is not the clipped one.
+        policy = policy + where_greater(clipped, unclipped, clipped, unclipped)
+        by = where_greater(clipped, unclipped, zero, unclipped)
+        entropy = fma(entropies, share, entropy)
+        divergence = fma(ratios - one - log_ratios, share, divergence)
+        away = ratios - one
+        away = where_greater(zero, away, zero - away, away)
+        clips = clips + where_greater(away, every(m, settings.clip_range), share, zero)
+        bonus = share * every(m, settings.ent_coef)
+        if plan.discrete:
+            _categorical_backward(m, plan, layers, row, by, bonus, entropies)
+        else:
+            _gaussian_backward(m, plan, layers, row, by, bonus)
+
+        values, returns = load(m, values_at + row), load(m, fields + 2 * rows + row)
+        slope = share * every(m, 2.0 * settings.vf_coef)
+        if settings.clip_range_vf < math.inf:
+            before, end = load(m, fields + 3 * rows + row), every(m, settings.clip_range_vf)
+            moved = values - before
+            kept = where_greater(moved, end, end, moved)
+            kept = where_greater(zero - end, kept, zero - end, kept)
+            slope = where_equal(kept, moved, slope, zero)
+            values = before + kept
+        errors = values - returns
+        squares = fma(errors * errors, share, squares)
+        store(m, by_values_at + row, errors * slope)
+    told[POLICY_LOSS], told[VALUE_LOSS], told[ENTROPY] = total(policy), total(squares), total(entropy)
+    told[DIVERGENCE], told[CLIPPED] = total(divergence), total(clips)
+
+
+@function
+def _norm(m: Any, plan: Any) -> Any:
+    """Of the whole gradient."""
+    lanes = width(m)
+    one = two = three = four = every(m, 0.0)
+    for at in range(plan.length, 2 * plan.length, 4 * lanes):
+        first, second = load(m, at), load(m, at + lanes)
+        third, fourth = load(m, at + 2 * lanes), load(m, at + 3 * lanes)
+        one, two = fma(first, first, one), fma(second, second, two)
+        three, four = fma(third, third, three), fma(fourth, fourth, four)
+    return root(np.float64(total((one + two) + (three + four))))
+
+
+@compiled
+def _power(base: float, exponent: int) -> float:
+    """By squaring: the C library's `pow` is another one on another machine."""
+    found = 1.0
+    while exponent:
+        if exponent & 1:
+            found *= base
+        base *= base
+        exponent >>= 1
+    return found
+
+
+@function
+def _adam(m: Any, plan: Any, settings: Any, step: int, norm: float) -> None:
+    """Clip the gradient to the largest norm, and make Adam's step."""
+    lanes, length = width(m), plan.length
+    clip = settings.max_grad_norm / (norm + 1e-6)
+    clip = every(m, clip if clip < 1.0 else 1.0)
+    first = every(m, 1.0 - settings.beta)
+    second, kept = every(m, 1.0 - settings.beta_square), every(m, settings.beta_square)
+    rate = every(m, -settings.learning_rate / (1.0 - _power(settings.beta, step)))
+    unbiased = every(m, 1.0 / root(1.0 - _power(settings.beta_square, step)))
+    eps = every(m, settings.eps)
+    for at in range(0, length, lanes):
+        gradient = load(m, length + at) * clip
+        mean, square = load(m, 2 * length + at), load(m, 3 * length + at)
+        mean = fma(gradient - mean, first, mean)
+        square = fma(gradient * second, gradient, square * kept)
+        store(m, 2 * length + at, mean)
+        store(m, 3 * length + at, square)
+        store(m, at, fma(mean / fma(root(square), unbiased, eps), rate, load(m, at)))
+
+
+@entry
+def update(
+    m: Any, plan: Any, layers: Any, settings: Any, samples: Any, orders: Any, size: int, told: Any
+) -> tuple[int, int, int]:
+    """All epochs and minibatches.
+
+    m: the array of a `Layout`.  samples: (n * plan.record,).  orders: (epochs, n) permutations.  size: of minibatches.
+    told: (minibatches, TOLD) is filled.  Returns how many minibatches were computed, the last of which makes no step
+    where `target_kl` has stopped the update; how many steps were made; and how many epochs were begun.
+    """
+    n, done, steps = orders.shape[1], 0, 0
+    for epoch in range(len(orders)):
+        for first in range(0, n, size):
+            count = min(size, n - first)
+            _gather(m, plan, samples, orders[epoch], first, count)
+            if settings.normalize_advantage and count > 1:
+                _normalize(m, plan, count)
+            forward(m, plan, layers, ACTOR)
+            forward(m, plan, layers, CRITIC)
+            _losses(m, plan, layers, settings, told[done])
+            done += 1
+            if told[done - 1, DIVERGENCE] > 1.5 * settings.target_kl:
+                return done, steps, epoch + 1
+            backward(m, plan, layers, ACTOR, count)
+            backward(m, plan, layers, CRITIC, count)
+            norm = _norm(m, plan)
+            told[done - 1, NORM] = norm
+            steps += 1
+            _adam(m, plan, settings, settings.steps + steps, norm)
+    return done, steps, len(orders)
+
+
+@entry
+def evaluate(
+    m: Any, plan: Any, layers: Any, samples: Any, order: Any, outputs: Any, values: Any, log_probs: Any
+) -> None:
+    """What the networks say of (n,) samples: (n, outputs), (n,), and log-probabilities (n,) of their actions."""
+    lanes, rows = width(m), plan.rows
+    n = len(order)
+    outputs_at, values_at = layers[ACTOR, plan.depth][5], layers[CRITIC, plan.depth][5]
+    for first in range(0, n, rows):
+        count = min(rows, n - first)
+        _gather(m, plan, samples, order, first, count)
+        forward(m, plan, layers, ACTOR)
+        forward(m, plan, layers, CRITIC)
+        for row in range(0, rows, lanes):
+            if plan.discrete:
+                found, _ = _categorical(m, plan, layers, row)
+            else:
+                found, _ = _gaussian(m, plan, layers, row)
+            store(m, plan.shares_at + row, found)
+        for row in range(count):
+            for output in range(plan.outputs):
+                outputs[first + row, output] = m[outputs_at + output * rows + row]
+            values[first + row] = m[values_at + row]
+            log_probs[first + row] = m[plan.shares_at + row]
+
+
+@functools.cache
+def prepare(dtype: Any) -> tuple[Any, Any]:
+    """`update` and `evaluate`, compiled for arrays of `dtype`, which are the only ones they then take."""
+    layout = Layout.of(Shape(1, 1, False, (1,), "tanh"), 1, np.dtype(dtype).itemsize)
+    m, row, rows = np.zeros(1, dtype), np.zeros(1, dtype), np.zeros((1, 1), dtype)
+    orders, told = np.zeros((1, 1), np.int64), np.zeros((1, TOLD))
+    settings = Settings(0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
+    entries: tuple[Any, Any] = update, evaluate
+    for one in entries:
+        one.disable_compile(False)
+    ready(
+        [
+            (update, (m, layout.plan, layout.layers, settings, row, orders, 1, told)),
+            (evaluate, (m, layout.plan, layout.layers, row, orders[0], rows, row, row)),
+        ]
+    )
+    for one in entries:
+        one.disable_compile()
+    return entries
