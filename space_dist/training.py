@@ -761,7 +761,7 @@ def memory_of(config: RunConfig) -> int:
     if config.engine != "population" or not isinstance(config.learner, PPOConfig | TRPOConfig):
         return 0
     env = make_env(config)
-    each = member_bytes(config.learner, env.observation_space, env.action_space)
+    each = member_bytes(config.learner, env.observation_space, env.action_space, config.device)
     return -(-config.members * each >> 20)
 
 

@@ -31,7 +31,11 @@ from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
 
 # What a member takes, measured (tests/test_population.py holds it against the memory of a process).
-_ROLLOUT_COPIES, _PER_STEP = 10, 8  # numbers beside observation and action: reward, value, advantage, ...
+_ROLLOUT_COPIES, _WAITING_COPIES, _PER_STEP = (
+    10,
+    4,
+    8,
+)  # numbers beside observation and action: reward, value, advantage, ...
 _TRPO_KEPT, _PPO_KEPT = 5, 6  # times the units of all layers
 _PARAMETER_COPIES = 10
 _OBJECTS_BYTES = 1 << 20
@@ -171,11 +175,14 @@ def stack_key(config: LearnerConfig, observation_space: spaces.Space[Any], actio
 
 
 def member_bytes(
-    config: PPOConfig | TRPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+    config: PPOConfig | TRPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], device: str
 ) -> int:
     """About what a member takes of its process's memory while it learns, no less: rollouts, activations, networks."""
     shape = _shape(config, observation_space, action_space)
     parameters = 2 * Layout(shape).length
+    if isinstance(config, PPOConfig) and device == "cpu":  # one learns at a time, and the others hold what they are
+        numbers = config.n_steps * _WAITING_COPIES * (shape.inputs + shape.outputs + _PER_STEP)
+        return _OBJECTS_BYTES + _NUMBER_BYTES * (numbers + parameters * _PARAMETER_COPIES)
     # TRPO's products with the Hessian go over the whole rollout at once, and need all that the actor has computed.
     samples, kept = (config.n_steps, _TRPO_KEPT) if isinstance(config, TRPOConfig) else (config.batch_size, _PPO_KEPT)
     numbers = (
