@@ -70,13 +70,14 @@ def one_ray() -> Iterator[None]:
 
     from space_dist.distributed import join_ray, remove_session
 
-    session = join_ray("local", 5)["session_dir"]
+    found = join_ray("local", 5)
+    joined = SimpleNamespace(address_info={**found, "session_dir": None})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray, "init", lambda **_: SimpleNamespace(address_info={"session_dir": None}))  # none of its own
+        patch.setattr(ray, "init", lambda **_: joined)  # none of its own
         patch.setattr(ray, "shutdown", lambda: None)
         yield
     ray.shutdown()
-    remove_session(session)
+    remove_session(found["session_dir"])
 
 
 # How long an example takes says more about the machine than about us.
