@@ -41,7 +41,7 @@ from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
-from space_dist.ray_watch import JOIN_SECONDS, START_SECONDS, Started, bounded, parts, reach, watched
+from space_dist.ray_watch import JOIN_SECONDS, SILENT_SECONDS, START_SECONDS, Started, bounded, parts, reach, watched
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
 from space_dist.walk import Walk
 
@@ -156,7 +156,7 @@ class RayCluster:
         resources = self._resources
         found = join_ray(resources.address, resources.workers + 1, self._heed)
         self._session = found["session_dir"] if resources.address == "local" else None
-        self._watch.enter_context(attended(found, resources.address, gone=True))
+        self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down))
         try:
             self._setup_piece = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
@@ -165,7 +165,6 @@ class RayCluster:
             while self._starting:
                 self._look_after_starting()
         except BaseException:
-            ray.shutdown()
             self._watch.close()
             raise
         return self
@@ -177,7 +176,6 @@ class RayCluster:
             for actor in self._actors.values():
                 ray.kill(actor)
             self._leave_room()
-        ray.shutdown()
         self._watch.close()
         if kind is None or issubclass(kind, Interrupted):
             remove_session(self._session)
@@ -512,17 +510,25 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
 
 
 @contextlib.contextmanager
-def attended(found: Mapping[str, Any], address: str, *, gone: bool) -> Iterator[None]:
-    """Watch the Ray that `join_ray` `found` at `address`; see `ray_watch.watched`. Afterwards none of ours is left."""
+def attended(found: Mapping[str, Any], address: str, *, gone: bool, leave: Callable[[], None]) -> Iterator[None]:
+    """Watch the Ray that `join_ray` `found` at `address`; see `ray_watch.watched`. Afterwards none of ours is left.
+
+    leave: shuts down or disconnects, once nobody watches any more: what ends on purpose has not died.
+    """
     started: Started | None = found["started"]
     where = "of our own" if started else f"at {address!r} (resources.address, or --address)"
     places = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
     if started is not None:
         started.look()
-    with watched(places, where, started, gone=gone):
-        yield
-    if started is not None:
-        started.end()
+    try:
+        with watched(places, where, started, gone=gone):
+            yield
+    finally:
+        late = f"the Ray {where} did not shut down in {SILENT_SECONDS:.0f} s. What was committed is intact"
+        with bounded(SILENT_SECONDS, late, started, Interrupted.exit_code):
+            leave()
+        if started is not None:
+            started.end()
 
 
 @contextlib.contextmanager
@@ -541,6 +547,10 @@ def _turn_to_start(heed: Callable[[], None]) -> Iterator[None]:
                 heed()
                 time.sleep(_LOOK_SECONDS)
         yield
+
+
+def _shut_down() -> None:
+    ray.shutdown()
 
 
 def remove_session(folder: str | None) -> None:

@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.cluster import Cluster, InProcess
-from space_dist.config import RunConfig
+from space_dist.config import PPOConfig, RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.errors import (
     ConfigError,
@@ -200,8 +200,15 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
 
 def _also_decide(config: RunConfig) -> list[str]:
     """The distributions whose arithmetic this run uses, besides those that every run does."""
-    bullet = config.env.id in BULLET_IDS
-    return [*(["scikit-learn"] if config.curriculum.kind == "alp_gmm" else []), *(["pybullet"] if bullet else [])]
+    ppo = isinstance(config.learner, PPOConfig)
+    compiled = ppo and (config.engine == "population" or getattr(config.learner, "update", "") == "lean")
+    also = {
+        "scikit-learn": config.curriculum.kind == "alp_gmm",
+        "pybullet": config.env.id in BULLET_IDS,
+        "numba": compiled,
+        "llvmlite": compiled,
+    }
+    return [name for name, used in also.items() if used]
 
 
 @functools.cache

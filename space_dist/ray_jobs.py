@@ -92,13 +92,14 @@ def _joined(
 
     # A run with rollout actors may have more processes than this machine has cores; they share them.
     context = join_ray(address, max(_cores(), (max_parallel or 1) * manifest.cpus_per_run), heed)
-    with attended(context, address, gone=False):  # whoever conducts says that itself
-        try:
-            yield context.get("webui_url") or ""
-        finally:
-            if ray_answers(context["gcs_address"]):
-                ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
-                remove_session(context["session_dir"] if address == "local" else None)
+
+    def leave() -> None:
+        if ray_answers(context["gcs_address"]):
+            ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
+            remove_session(context["session_dir"] if address == "local" else None)
+
+    with attended(context, address, gone=False, leave=leave):  # whoever conducts says itself that it is gone
+        yield context.get("webui_url") or ""
 
 
 def _cores() -> int:

@@ -104,9 +104,11 @@ def _is_of_ray(process: psutil.Process) -> bool:
 
 
 @contextlib.contextmanager
-def bounded(seconds: float, sentence: str, started: Started | None) -> Iterator[None]:
-    """End the process with `sentence` and exit code 1 if the block takes longer: Ray itself cannot be interrupted."""
-    timer = threading.Timer(seconds, _end, (sentence, started, SpaceDistError.exit_code))
+def bounded(
+    seconds: float, sentence: str, started: Started | None, code: int = SpaceDistError.exit_code
+) -> Iterator[None]:
+    """End the process with `sentence` and `code` if the block takes longer: Ray itself cannot be interrupted."""
+    timer = threading.Timer(seconds, _end, (sentence, started, code))
     timer.daemon = True
     timer.start()
     try:

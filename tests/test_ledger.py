@@ -777,6 +777,18 @@ def failing(number: int) -> Callable[..., NoReturn]:
     return fail
 
 
+def failing_to_write(number: int) -> Callable[..., int]:
+    """`os.open` on a disk that can be read."""
+    really = os.open
+
+    def fail(path: object, flags: int, *more: Any, **options: Any) -> int:
+        if flags & (os.O_WRONLY | os.O_RDWR):
+            raise OSError(number, os.strerror(number), str(path))
+        return really(path, flags, *more, **options)  # type: ignore[call-overload, no-any-return]
+
+    return fail
+
+
 REFUSALS = [
     (errno.ENOSPC, "the disk is full"),
     (errno.EROFS, "the file system is read-only"),
@@ -804,7 +816,7 @@ def test_a_disk_that_refuses_is_told_in_one_sentence(
         writer.restore()
         append_round(writer, 4)
         with monkeypatch.context() as patch:
-            patch.setattr(module.os, where, failing(number))
+            patch.setattr(module.os, where, failing_to_write(number) if where == "open" else failing(number))
             with pytest.raises(LedgerError) as caught:
                 WRITES[write](writer)
         assert said in str(caught.value)

@@ -371,7 +371,10 @@ def test_one_instance_does_not_take_all_episodes_of_an_update_unless_asked_to() 
 
 
 def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:
-    plr = LevelReplay(instances(5), seed=0, draws=Draws(40, 4), temperature=0.1, staleness_share=0.1)
+    plr = LevelReplay(
+        instances(5), seed=0, draws=Draws(40, 4), temperature=0.1, staleness_share=0.1,
+        within_update="without_repetition",
+    )  # fmt: skip
     state, selection = plr.start()
     after, again, numbers = plr.step(state, feedback(0, np.zeros(0, dtype=np.int64), n=5, advantages=0.0))
     assert (after.version, numbers["seen"], numbers["mean_score"]) == (1, 0, None)

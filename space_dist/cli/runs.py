@@ -140,6 +140,7 @@ def explain(
     train = read_csv(ledger.instances("train"), make_env(config).context_bounds, config.curriculum.columns)
     for line in explain_decision(ledger, config, train, iteration):
         print(line)
+    delivered()
 
 
 def report(

@@ -55,9 +55,11 @@ def keep_outputs() -> None:
         elif stream is getattr(sys, f"__{name}__") and number not in _outputs:
             stream.flush()
             output = _outputs[number] = _Output(number, "w", closefd=False)
+            at_once: bool = stream.write_through  # PYTHONUNBUFFERED
             setattr(sys, name, io.TextIOWrapper(
-                io.BufferedWriter(output), encoding=stream.encoding, errors=stream.errors,
-                line_buffering=number == 2 or output.isatty(),
+                output if at_once else io.BufferedWriter(output),  # as Python itself does
+                encoding=stream.encoding, errors=stream.errors,
+                line_buffering=number == 2 or output.isatty(), write_through=at_once,
             ))  # fmt: skip
 
 

@@ -104,8 +104,11 @@ def _folder(kinds: str) -> Path | None:
     for place in places:
         folder = place / "kernels" / name
         with contextlib.suppress(OSError):
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if all(_own(one) for one in (folder, folder.parent)):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            way = (place, folder.parent, folder)
+            for one in way:  # one by one: a mode is that of the last folder alone, the others would have the umask's
+                one.mkdir(mode=0o700, exist_ok=True)
+            if all(_own(one) for one in way):
                 tempfile.TemporaryFile(dir=folder).close()
                 return folder
     return None

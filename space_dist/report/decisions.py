@@ -99,9 +99,12 @@ def _growth(
             f"Line 7: change {_short(reading.change)} {'<=' if within else '>'} eta * max(V_t-1, 1e-8) = {_short(eta)} "
             f"* {_short(max(reading.reference, 1e-8))}, a relative change of {_short(reading.relative())}"
         )
-    how = {"add": f"+ {settings.kappa}", "multiply": f"* {settings.kappa}", "schedule": f"+ {settings.kappa}"}
+    times = settings.growth == "multiply"
+    wanted = f"{before.size} {'*' if times else '+'} {settings.kappa}"
+    if after.size < (before.size * settings.kappa if times else before.size + settings.kappa):
+        wanted = f"min({wanted}, {after.size})"
     yield (
-        f"Line 8: S := {before.size} {how[settings.growth]} = {after.size}" if numbers["grew"]
+        f"Line 8: S := {wanted} = {after.size}" if numbers["grew"]
         else f"Line 8: S stays {after.size}, after {after.stalled} tests without growth"
     )  # fmt: skip
 

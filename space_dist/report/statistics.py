@@ -1,7 +1,7 @@
 """What a handful of seeds allows one to say (after Agarwal et al. 2021, "Deep RL at the edge of the precipice").
 
 All intervals are to cover 95 %, and are computed, not drawn: no number of a report hangs on a random generator.
-Percentile bootstraps, which the field uses, do not cover what they promise with few seeds: 76 % at three, 91 % at five.
+Percentile bootstraps, which the field uses, do not cover what they promise with few seeds: 74 % at three, 89 % at five.
 `python jobs/benchmark.py coverage` measures both on populations of every kind; docs/reports.md has the table.
 
 IQM, mean       centre +- t se, t of Student's distribution; se is the larger one of two standard errors: that of the
