@@ -172,11 +172,12 @@ def test_v0_zero_makes_the_first_changes_the_values_themselves():
         assert values.tolist() == (first.tolist() if v0 == "network" else [0.0] * 4)
         new, selection, numbers, after = central.decide(start, values, 0, 1, {"after": 1}, second)
         assert (numbers["grew"], selection.ids.tolist(), after.tolist()) == (grew, ids, second.tolist())
-        # Rescored under new scales, the values before are new ones; zeros stay zeros.
+        assert numbers["mean_value_before"] == (8.0 if v0 == "network" else 0)
+        # Rescored under new scales, the values before are new ones; zeros are never sent to be rescored.
         _, selection, numbers, _ = central.decide(
             start, values, 0, 1, {"after": 1, "rescored": 1}, second, first + 0.25
         )
-        assert numbers["mean_value_before"] == (8.25 if v0 == "network" else 0)
+        assert numbers["mean_value_before"] == 8.25
         _, _, numbers, _ = central.decide(
             new, after, 1, 1, {"after": 1, "rescored": 1}, second, np.array([1.0, 2.0, 3.0, 4.0])
         )
