@@ -19,14 +19,14 @@ os.environ.setdefault("RAY_worker_niceness", "0")  # beside other tests, the nic
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that start Slurm, Ray or servers come first: they take longest, and must not be begun last.
+    """Files that start Slurm, an emulator, Ray or servers come first: they take longest, and must not be begun last.
 
     pytest-xdist deals out whole files in this order, with `--no-loadscope-reorder`.
     """
     ranks: dict[Path, int] = {}
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        rank = 0 if "slurm" in marks else 1 if marks & {"ray", "server"} else 2
+        rank = 0 if marks & {"slurm", "qemu"} else 1 if marks & {"ray", "server"} else 2
         ranks[item.path] = min(rank, ranks.get(item.path, rank))
     items.sort(key=lambda item: ranks[item.path])
 

@@ -1,0 +1,72 @@
+"""Other makers' CPUs, by qemu-user: runs there must have the bits of runs here."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from space_dist.errors import Interrupted
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
+from space_dist.ledger import Ledger
+from tests.golden.cases import CASES, DIGESTS, ROOT, config_of, digests_of
+
+GOLDEN = json.loads(DIGESTS.read_text())
+PARTS = 4  # of the cases: an emulator takes minutes for all of them
+STOPPED = "spdrl"  # a run that is stopped here and goes on elsewhere: curriculum, optimiser, actors, learner
+_PATIENCE = 1400.0  # seconds
+
+
+def emulator() -> str | None:
+    """qemu-user of version 8 or newer (7.2 emulates an instruction of NumPy's argsort wrongly)."""
+    found = shutil.which("qemu-x86_64")
+    if found is None:
+        return None
+    said = subprocess.run([found, "--version"], capture_output=True, text=True).stdout
+    return found if int(said.split("version ")[1].split(".")[0]) >= 8 else None
+
+
+needs_emulator = pytest.mark.skipif(emulator() is None, reason="qemu-user 8 or newer is not installed")
+
+
+def emulated(cpu: str, *arguments: str) -> str:
+    command = [emulator() or "", "-cpu", cpu, sys.executable, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=_PATIENCE)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def compare(cpu: str, part: int) -> None:
+    """Run one part of the cases on `cpu` and compare all digests with the golden ones."""
+    names = list(CASES)[part::PARTS]
+    found = json.loads(emulated(cpu, "-m", "tests.golden", *names).splitlines()[-1])
+    assert found == {"arithmetic": GOLDEN["arithmetic"], "cases": {name: GOLDEN["cases"][name] for name in names}}
+
+
+def stop_here_go_on_there(cpu: str, folder: Path) -> None:
+    """A run that is stopped natively and resumed on `cpu` has the golden bits, and no mark."""
+    looks = 0
+
+    class Stop(StopRequests):
+        def reason(self) -> str | None:
+            nonlocal looks
+            looks += 1
+            return "the test" if looks == 2 else None
+
+    with pytest.raises(Interrupted):
+        launch(
+            config_of(STOPPED, folder, ("checkpoint.every_rounds=1",)), folder / "run", resume=False, stop=Stop()
+        )  # fmt: skip
+    stopped = Ledger(folder / "run").status()
+    assert 0 < stopped.steps < stopped.budget_steps
+    emulated(cpu, "-m", "space_dist.cli", "train", str(folder / "run" / "config.yaml"), "--out",
+             str(folder / "run"), "--resume", "--workers", "0")  # fmt: skip
+    status = Ledger(folder / "run").status()
+    assert (status.state, status.fingerprint_changed) == ("done", False)
+    assert status.fingerprint == stopped.fingerprint
+    assert digests_of(folder / "run") == GOLDEN["cases"][STOPPED]
