@@ -81,7 +81,7 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (train("learner.kind=dqn"), ["learner"]),
         (train("instances.train=nowhere.csv"), ["nowhere.csv"]),
         (train(f"instances.train={TEST}"), ["overlap", "id 100"]),
-        (train("tracking.uri=mysql://x"), ["tracking.uri", "sqlite:///"]),
+        (train("tracking.uri=mysql://x"), ["tracking.uri", "sqlite:////absolute/path/mlflow.db"]),
         (["train", CONFIG, "--workers", "many"], ["--workers"]),
         (["train", CONFIG, "--no-such-option"], ["no-such-option"]),
         (["no-such-command"], ["no-such-command"]),

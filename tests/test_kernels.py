@@ -226,6 +226,15 @@ def test_a_folder_that_others_may_write_to_is_not_run(place: Path, monkeypatch: 
     assert len(list((place.parent / "cache").rglob("*.nbc"))) == 1
 
 
+def test_under_a_groups_umask_the_folders_are_still_the_users_own(place: Path) -> None:
+    before = os.umask(0o002)
+    try:
+        build.ready([(small_entry(), (1.0,))])
+    finally:
+        os.umask(before)
+    assert len(list(place.rglob("*.nbc"))) == 1
+
+
 def test_without_any_folder_it_still_compiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     nowhere = tmp_path / "file"
     nowhere.touch()

@@ -202,7 +202,8 @@ def test_every_member_learns_what_stable_baselines3_does(
     if kind == "ppo":
         assert min(least_steps) < 6 == max(least_steps)  # target_kl has stopped some, and left others alone
     else:
-        assert 1.0 in found  # which of them fail hangs on rounding; that they fail alike was compared above
+        assert 1.0 in found
+        assert env_id != LINE or 0.0 in found  # elsewhere, whether one fails hangs on rounding
     for reference, mine in zip(references, members, strict=True):
         (theirs_saved, theirs_data), (saved, data) = reference.save(), mine.save()
         assert data == theirs_data
