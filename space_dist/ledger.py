@@ -427,7 +427,12 @@ def _rows_under(checkpoint: Checkpoint) -> dict[str, tuple[int, str]]:
 
 
 def _savez(buffer: io.BytesIO, arrays: Mapping[str, NDArray[Any]]) -> None:
-    np.savez(buffer, allow_pickle=False, **dict(arrays))
+    """An uncompressed npz. NumPy's own streams into the archive, whose headers then differ by Python's version."""
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.asanyarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getbuffer())
 
 
 def _digest(meta: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from space_dist import config as configs
+from space_dist import ledger as ledgers
 from space_dist.errors import LedgerError, SpaceDistError
+from space_dist.files import read_file
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, policy_of, stored_config
 from space_dist.ledger import METRICS, ROW_FILES, Checkpoint, Ledger, RunWriter, decode_checkpoint
@@ -234,14 +236,13 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_thrown_away(
     shutil.copytree(folder, copy)
     (copy / "status.json").unlink()  # a run that is done is not restored
     checkpoints = Ledger(copy).checkpoint_files()
-    read_bytes = Path.read_bytes
 
-    def unreadable(path: Path) -> bytes:
+    def unreadable(path: Path, limit: int = -1) -> bytes:
         if path == checkpoints[0]:
             raise OSError(5, "Input/output error")
-        return read_bytes(path)
+        return read_file(path, limit)
 
-    monkeypatch.setattr(Path, "read_bytes", unreadable)
+    monkeypatch.setattr(ledgers, "read_file", unreadable)
     with pytest.raises(SpaceDistError, match=r"cannot be resumed now: .* cannot be read \(Input/output error\)"):
         launch(config, copy, resume=True, stop=StopRequests())
     assert Ledger(copy).checkpoint_files() == checkpoints
