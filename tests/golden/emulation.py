@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -34,11 +37,44 @@ def emulator() -> str | None:
 needs_emulator = pytest.mark.skipif(emulator() is None, reason="qemu-user 8 or newer is not installed")
 
 
-def emulated(cpu: str, *arguments: str) -> str:
-    command = [emulator() or "", "-cpu", cpu, sys.executable, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=_PATIENCE)
+_TARGET = """
+import json, llvmlite.binding as llvm
+features = llvm.get_host_cpu_features().flatten()
+print(json.dumps({"NUMBA_CPU_NAME": llvm.get_host_cpu_name(), "NUMBA_CPU_FEATURES": features}))
+"""
+_COMPILE = """
+import numpy as np
+from space_dist.kernels import prepare
+prepare(np.float32)
+"""
+
+
+def _run(command: list[str], environment: dict[str, str] | None = None) -> str:
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, timeout=_PATIENCE, env=environment or dict(os.environ)
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
+
+
+@functools.cache
+def _environment(cpu: str) -> dict[str, str]:
+    """The environment of what is emulated: the kernels have been compiled here for the CPU that `cpu` says it is.
+
+    Compiling under an emulator takes minutes, and is the same work: only what is compiled runs on the CPU.
+    """
+    target = json.loads(_run([emulator() or "", "-cpu", cpu, sys.executable, "-c", _TARGET]))
+    folder = (
+        Path(tempfile.gettempdir()) / f"space-dist-golden-{os.getuid()}"
+    )  # kept: pytest's folders are others each time
+    folder.mkdir(mode=0o700, exist_ok=True)
+    environment = dict(os.environ) | target | {"NUMBA_CACHE_DIR": str(folder)}
+    _run([sys.executable, "-c", _COMPILE], environment)
+    return environment
+
+
+def emulated(cpu: str, *arguments: str) -> str:
+    return _run([emulator() or "", "-cpu", cpu, sys.executable, *arguments], _environment(cpu))
 
 
 def compare(cpu: str, part: int) -> None:
