@@ -28,17 +28,20 @@ def told(train: InstanceSet, shards: Sequence[Shard], advantages: FloatArray | N
 
     ids = column("ids")
     unknown = np.full(len(ids), np.nan)
+    running = np.concatenate([shard.unfinished.ids[shard.unfinished.lengths > 0] for shard in shards])
     return Episodes(
         indices=np.where(ids == GENERATED, GENERATED, np.searchsorted(train.ids, ids)), contexts=column("contexts"),
         returns=column("returns"), discounted_returns=column("discounted_returns"), lengths=column("lengths"),
         success=column("success"), start_values=unknown, advantages=unknown if advantages is None else advantages,
+        running=np.searchsorted(train.ids, running[running != GENERATED]),
     )  # fmt: skip
 
 
 def joined_episodes(parts: Sequence[Episodes]) -> Episodes:
-    """The episodes of all rounds of an iteration, in order."""
-    names = [field.name for field in dataclasses.fields(Episodes)]
-    return Episodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    """The episodes of all rounds of an iteration, in order; what runs on is what does after the last."""
+    names = [field.name for field in dataclasses.fields(Episodes) if field.name != "running"]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Episodes(**columns, running=parts[-1].running)
 
 
 def mean_sizes(shards: Sequence[Shard], sizes: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -42,6 +42,8 @@ from space_dist.envs import make_batched
 from space_dist.episodes import mean_sizes
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
 from space_dist.learner import Ensemble, make_learner
 from space_dist.policy import EnsemblePolicy, Statistics
 from space_dist.rollout import Episodes as Table
@@ -65,7 +67,7 @@ def instances(n: int, **columns: Any) -> InstanceSet:
 
 def feedback(
     version: int, indices: Any, contexts: np.ndarray | None = None, *, n: int = 4, returns: Any = 0.0,
-    advantages: Any = math.nan, members: Any = None, probes: Probes | None = None,
+    advantages: Any = math.nan, members: Any = None, probes: Probes | None = None, running: Any = (),
 ) -> Feedback:  # fmt: skip
     m = len(indices)
     broadcast = lambda value, kind=np.float64: np.broadcast_to(value, m).astype(kind)  # noqa: E731
@@ -73,7 +75,7 @@ def feedback(
         indices=np.array(indices), contexts=np.zeros((m, 2)) if contexts is None else contexts,
         returns=broadcast(returns), discounted_returns=broadcast(0.0), lengths=broadcast(1, np.int64),
         success=broadcast(0.0), start_values=broadcast(0.0),
-        advantages=broadcast(advantages),
+        advantages=broadcast(advantages), running=np.array(running, dtype=np.int64),
     )  # fmt: skip
     return Feedback(
         version, np.zeros(n), np.ones(n), 1, episodes=episodes, probes=probes,
@@ -368,6 +370,55 @@ def test_one_instance_does_not_take_all_episodes_of_an_update_unless_asked_to() 
     assert spreads["without_repetition"] == pytest.approx(5.0)
     assert spreads["fixed_chances"] < 3.0
     assert configs.load(SPACE, ["curriculum={kind: plr}"]).curriculum.within_update == "without_repetition"
+
+
+@pytest.mark.parametrize("rule", ["without_repetition", "fixed_chances"])
+def test_what_still_runs_is_not_begun_again(rule: Any) -> None:
+    plr = LevelReplay(
+        instances(6), seed=0, draws=Draws(12, 2), temperature=0.1, staleness_share=0.1, within_update=rule
+    )
+    state, selection = plr.start()
+    heads = in_order(selection) - 10
+    # Of the first four that were begun two have ended, the others run on.
+    state, selection, _ = plr.step(state, feedback(0, heads[:2], n=6, advantages=[1.0, 2.0], running=heads[[3, 2, 2]]))
+    assert state.running.tolist() == sorted(heads[2:4])
+    drawn = in_order(selection) - 10
+    assert drawn[:2].tolist() == heads[4:6].tolist()  # unseen, and not running
+    assert set(drawn[2:4]) <= set(heads[:2])
+    if rule == "without_repetition":
+        assert set(drawn[2:4]) == set(heads[:2])  # both before any of those that run
+        assert set(drawn[4:8]) == set(heads[:4])  # then all that were begun, anew
+    # Of all that were begun everything runs: there is nothing else to draw.
+    state, selection, _ = plr.step(state, feedback(1, heads, n=6, advantages=1.0, running=heads))
+    assert set(in_order(selection)) <= set(range(10, 16))
+    if rule == "without_repetition":
+        assert (np.sort(in_order(selection).reshape(2, 6), axis=1) == np.arange(10, 16)).all()
+
+
+def test_every_instance_is_begun_once_before_any_is_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    """Episodes of 100 steps over rounds of 48 a slot: at any time most of what was begun has not ended."""
+    begun, step = [], LevelReplay.step
+
+    def recorded(self: LevelReplay, state: Any, feedback: Feedback) -> Any:
+        assert feedback.episodes is not None
+        ended = [one for episodes in begun[-1:] for one in episodes[0]] + feedback.episodes.indices.tolist()
+        begun.append((ended, feedback.episodes.running.tolist()))
+        return step(self, state, feedback)
+
+    monkeypatch.setattr(LevelReplay, "step", recorded)
+    config = configs.load(SPACE, [
+        "curriculum={kind: plr}", "learner.n_steps=768", "learner.n_epochs=1", "learner.net_arch=[8]",
+        "rollout.slots=8", "rollout.shards=2", "budget.steps=12288", "evaluation.every_steps=100000",
+        "tracking.uri=null", "resources.workers=0",
+    ])  # fmt: skip
+    launch(config, tmp_path / "run", resume=False, stop=StopRequests())
+    counts = [len(ended) + len(running) for ended, running in begun]
+    assert counts[-1] > 100
+    for ended, running in begun:
+        together = [*ended, *running]
+        assert len(together) > 90 or len(set(together)) == len(together)  # the shards do not begin equally many
 
 
 def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:

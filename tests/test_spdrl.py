@@ -292,6 +292,7 @@ def feedback(state: ContextState, contexts: np.ndarray, values: Any = 1.0) -> Fe
         indices=np.full(m, -1), contexts=contexts, returns=np.ones(m), discounted_returns=np.arange(m, dtype=float),
         lengths=np.ones(m, dtype=np.int64), success=np.zeros(m),
         start_values=np.broadcast_to(values, m).astype(float), advantages=np.full(m, np.nan),
+        running=np.arange(0),
     )  # fmt: skip
     return Feedback(state.version, np.zeros(4), np.ones(4), 1, episodes=episodes)
 

@@ -51,6 +51,7 @@ class Episodes:
     lengths: (m,) in steps.  success: (m,) 1 or 0, NaN where the environment knows no success.
     start_values: (m,) V(s0, c) behind the iteration's updates, in reward units.
     advantages: (m,) mean |GAE| over the episode's steps, in reward units; NaN for learners without advantages.
+    running: (k,) the instances, one an episode, of what had begun and not ended when the iteration did; into the set.
     """
 
     indices: IntArray
@@ -61,6 +62,7 @@ class Episodes:
     success: FloatArray
     start_values: FloatArray
     advantages: FloatArray
+    running: IntArray
 
 
 @dataclass(frozen=True)

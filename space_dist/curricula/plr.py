@@ -5,7 +5,8 @@ behind its update. Drawn from the paper's chances as they stand (`fixed_chances`
 are of one instance: with beta = 0.1 the first rank has 99.9 % of its term, and nothing happens between two draws that
 could take it away. In the paper's loop it is taken away: an instance that was played is learned from, its score falls,
 and its staleness is 0. So by default what was drawn leaves the ranking until everything else was drawn
-(`without_repetition`), and staleness grows with every draw.
+(`without_repetition`), and staleness grows with every draw. What still runs when an iteration ends was drawn, too: its
+score is not known yet, and it is not begun a second time meanwhile.
 """
 
 from __future__ import annotations
@@ -31,11 +32,13 @@ class ReplayState(DrawnState):
     scores: (n,) mean |GAE| when an instance was last trained on, in reward units; 0 where it never was.
     last: (n,) the episode of the run, counted from 0, in which it was last trained on; -1 where it never was.
     episodes: how many the run has trained on.
+    running: (k,) indices of the instances of which an episode runs on, ascending.
     """
 
     scores: FloatArray
     last: IntArray
     episodes: int
+    running: IntArray
 
 
 class LevelReplay(Drawn):
@@ -61,7 +64,7 @@ class LevelReplay(Drawn):
     def start(self) -> tuple[ReplayState, Selection]:
         """Nothing was trained on yet."""
         n = len(self._instances)
-        state = ReplayState(0, uniform(n), scores=np.zeros(n), last=np.full(n, -1), episodes=0)
+        state = ReplayState(0, uniform(n), scores=np.zeros(n), last=np.full(n, -1), episodes=0, running=np.arange(0))
         return state, self.selection(state)
 
     def step(self, state: ReplayState, feedback: Feedback) -> tuple[ReplayState, Selection, Numbers]:
@@ -81,7 +84,7 @@ class LevelReplay(Drawn):
                 scores, count - 1 - last, last >= 0, self._ties, self._temperature, self._staleness_share
             ) if count else uniform(n)
         )  # fmt: skip
-        new = ReplayState(state.version + 1, chances, scores, last, count)
+        new = ReplayState(state.version + 1, chances, scores, last, count, np.unique(episodes.running))
         seen, sequence = last >= 0, self._sequence(new)
         shares = np.bincount(sequence[: max(1, m)], minlength=n) / max(1, min(m, len(sequence)))
         numbers = self._numbers(feedback, chances)
@@ -94,23 +97,27 @@ class LevelReplay(Drawn):
         return new, self._drawn(new.version, sequence), numbers
 
     def selection(self, state: ReplayState) -> Selection:
-        """What was never trained on, then draws by rank and staleness."""
+        """What was never begun, then draws by rank and staleness."""
         return self._drawn(state.version, self._sequence(state))
 
     def _sequence(self, state: ReplayState) -> IntArray:
         """`(count,)` indices in the order in which they are to be used."""
-        unseen = np.flatnonzero(state.last < 0)
+        runs = np.isin(np.arange(len(state.last)), state.running)
+        unseen = np.flatnonzero((state.last < 0) & ~runs)
         unseen = unseen[np.argsort(self._ties[unseen], kind="stable")][: self._draws.count]
         if self._within_update == "fixed_chances":
             drawn = self._by_chance(state.version, state.chances)
         else:
-            seen = state.last >= 0
-            members = np.flatnonzero(seen if seen.any() else ~seen)
+            begun = (state.last >= 0) | runs
+            members = np.flatnonzero(begun if begun.any() else ~begun)
             ranked = members[np.lexsort((self._ties[members], -state.scores[members]))]
             # Draws of what was never seen are episodes as well: what was seen is staler behind them.
             now = state.episodes - 1 + len(unseen)
             random = generator(self._seed, Purpose.DRAWS, state.version).random((self._draws.count - len(unseen), 2))
-            drawn = replayed(ranked, now - state.last[ranked], random, self._temperature, self._staleness_share)
+            staleness = np.where(runs, len(unseen), now - state.last)[ranked]
+            drawn = replayed(
+                ranked, staleness, random, self._temperature, self._staleness_share, already=runs[ranked]
+            )  # fmt: skip
         return np.concatenate([unseen, drawn])[: self._draws.count]
 
 
@@ -134,20 +141,22 @@ def replay_chances(
 
 
 def replayed(
-    ranked: IntArray, staleness: IntArray, random: FloatArray, temperature: float, share: float
+    ranked: IntArray, staleness: IntArray, random: FloatArray, temperature: float, share: float, *,
+    already: BoolArray | None = None,
 ) -> IntArray:  # fmt: skip
     """`(k,)` of the (m,) instances `ranked`, the first of them the best, drawn without repetition; then all anew.
 
     Each draw has the chances of `replay_chances` over what was not drawn yet in this pass, with ranks from 1, and
     staleness as of then.
     staleness: (m,) at the first draw, in episodes.  random: (k, 2) uniform numbers; the first of a row says by which
-    term it draws, the second what.
+    term it draws, the second what.  already: (m,) what has been drawn in the first pass; None: nothing.
     """
     m = len(ranked)
     below = np.cumsum(np.arange(1, m + 1) ** (-1.0 / temperature)).tolist()  # chances of the first ranks, not scaled
     fresh_at = -staleness.astype(np.int64)  # the draw at which the staleness of each is 0
     drawn: list[int] = []
-    left: list[int] = []  # places in `ranked`, the best last: where a list is quick to lose one
+    begun = np.zeros(m, dtype=np.bool_) if already is None else already
+    left = np.flatnonzero(~begun)[::-1].tolist()  # places in `ranked`, the best last: where a list is quick to lose one
     for place, (term, point) in enumerate(random.tolist()):
         if not left:
             left = list(range(m - 1, -1, -1))
