@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from tests.golden.emulation import PARTS, compare, needs_emulator, stop_here_go_on_there
+from tests.golden.emulation import GOLDEN, STOPPED, Emulated, emulate, needs_emulator
 
-CPU = "Haswell"
 pytestmark = [pytest.mark.qemu, needs_emulator]
 
 
-@pytest.mark.parametrize("part", range(PARTS))
-def test_runs_have_the_golden_bits(part: int) -> None:
-    compare(CPU, part)
+@pytest.fixture(scope="module")
+def emulated(tmp_path_factory: pytest.TempPathFactory) -> Emulated:
+    return emulate("Haswell", tmp_path_factory.mktemp("stopped"))
 
 
-def test_a_run_stopped_here_goes_on_there_unmarked(tmp_path: Path) -> None:
-    stop_here_go_on_there(CPU, tmp_path)
+def test_runs_have_the_golden_bits(emulated: Emulated) -> None:
+    assert emulated.printed == GOLDEN
+
+
+def test_a_run_stopped_here_goes_on_there_unmarked(emulated: Emulated) -> None:
+    assert 0 < emulated.stopped.steps < emulated.stopped.budget_steps
+    assert (emulated.ended.state, emulated.ended.fingerprint_changed) == ("done", False)
+    assert emulated.ended.fingerprint == emulated.stopped.fingerprint
+    assert emulated.resumed == GOLDEN["cases"][STOPPED]

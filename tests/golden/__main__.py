@@ -1,26 +1,38 @@
 """`python -m tests.golden [CASE ...]`: run cases here and print their digests; `--write` makes them the golden ones.
 
+`--resume FOLDER` has the run that was stopped in that folder go on to its end first.
+
 A golden digest changes on purpose only, with a line in CHANGELOG.md that says why and by how much results move.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import tempfile
 from pathlib import Path
 
-from space_dist.launch import arithmetic_digest
+from space_dist import config as configs
+from space_dist.interrupts import StopRequests
+from space_dist.launch import arithmetic_digest, launch
 from tests.golden.cases import CASES, DIGESTS, run
 
 
 def main() -> None:
-    names = [name for name in sys.argv[1:] if name != "--write"] or list(CASES)
+    parser = argparse.ArgumentParser(prog="python -m tests.golden")
+    parser.add_argument("cases", nargs="*", choices=[[], *CASES], metavar="CASE")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--resume", type=Path, metavar="FOLDER")
+    asked = parser.parse_args()
+    if asked.resume is not None:
+        launch(configs.load(asked.resume / "config.yaml"), asked.resume, resume=True, stop=StopRequests())
+    names = asked.cases or list(CASES)
     found = {"arithmetic": arithmetic_digest(), "cases": {}}
     with tempfile.TemporaryDirectory() as folder:
         for number, name in enumerate(names):
             found["cases"][name] = run(name, Path(folder) / str(number))
-    if "--write" in sys.argv:
+    if asked.write:
         known = json.loads(DIGESTS.read_text())["cases"] if DIGESTS.exists() else {}
         cases = {name: digests for name, digests in (known | found["cases"]).items() if name in CASES}
         found = {"arithmetic": found["arithmetic"], "cases": {name: cases[name] for name in CASES}}

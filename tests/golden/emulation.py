@@ -9,18 +9,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from space_dist.errors import Interrupted
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
-from space_dist.ledger import Ledger
-from tests.golden.cases import CASES, DIGESTS, ROOT, config_of, digests_of
+from space_dist.ledger import Ledger, Status
+from tests.golden.cases import DIGESTS, ROOT, config_of, digests_of
 
 GOLDEN = json.loads(DIGESTS.read_text())
-PARTS = 4  # of the cases: an emulator takes minutes for all of them
 STOPPED = "spdrl"  # a run that is stopped here and goes on elsewhere: curriculum, optimiser, actors, learner
 _PATIENCE = 1400.0  # seconds
 
@@ -73,19 +74,18 @@ def _environment(cpu: str) -> dict[str, str]:
     return environment
 
 
-def emulated(cpu: str, *arguments: str) -> str:
-    return _run([emulator() or "", "-cpu", cpu, sys.executable, *arguments], _environment(cpu))
+@dataclass(frozen=True)
+class Emulated:
+    """What one process under an emulator printed, and a run that was stopped here and went on there."""
+
+    printed: Any
+    stopped: Status
+    ended: Status
+    resumed: dict[str, str]
 
 
-def compare(cpu: str, part: int) -> None:
-    """Run one part of the cases on `cpu` and compare all digests with the golden ones."""
-    names = list(CASES)[part::PARTS]
-    found = json.loads(emulated(cpu, "-m", "tests.golden", *names).splitlines()[-1])
-    assert found == {"arithmetic": GOLDEN["arithmetic"], "cases": {name: GOLDEN["cases"][name] for name in names}}
-
-
-def stop_here_go_on_there(cpu: str, folder: Path) -> None:
-    """A run that is stopped natively and resumed on `cpu` has the golden bits, and no mark."""
+def emulate(cpu: str, folder: Path) -> Emulated:
+    """All cases on `cpu`, after the rest of a run that was stopped natively. One process: its imports take a minute."""
     looks = 0
 
     class Stop(StopRequests):
@@ -94,15 +94,10 @@ def stop_here_go_on_there(cpu: str, folder: Path) -> None:
             looks += 1
             return "the test" if looks == 2 else None
 
+    config, run = config_of(STOPPED, folder, ("checkpoint.every_rounds=1",)), folder / "run"
     with pytest.raises(Interrupted):
-        launch(
-            config_of(STOPPED, folder, ("checkpoint.every_rounds=1",)), folder / "run", resume=False, stop=Stop()
-        )  # fmt: skip
-    stopped = Ledger(folder / "run").status()
-    assert 0 < stopped.steps < stopped.budget_steps
-    emulated(cpu, "-m", "space_dist.cli", "train", str(folder / "run" / "config.yaml"), "--out",
-             str(folder / "run"), "--resume", "--workers", "0")  # fmt: skip
-    status = Ledger(folder / "run").status()
-    assert (status.state, status.fingerprint_changed) == ("done", False)
-    assert status.fingerprint == stopped.fingerprint
-    assert digests_of(folder / "run") == GOLDEN["cases"][STOPPED]
+        launch(config, run, resume=False, stop=Stop())
+    stopped = Ledger(run).status()
+    command = [emulator() or "", "-cpu", cpu, sys.executable, "-m", "tests.golden", "--resume", str(run)]
+    printed = json.loads(_run(command, _environment(cpu)).splitlines()[-1])
+    return Emulated(printed, stopped, Ledger(run).status(), digests_of(run))
