@@ -189,6 +189,7 @@ def rehearse(
         until(lambda: not _marked(mark), _LEFT_SECONDS)
         if left := _marked(mark):  # the servers have ended, too
             result.faults.append(f"left behind in the end: {'; '.join(map(_in_words, left))}")
+        until(lambda: not _temporary(folder / "tmp"), _LEFT_SECONDS)  # a large folder is removed after its owner's end
         if names := _temporary(folder / "tmp"):
             result.faults.append(f"temporary files were left behind: {', '.join(names)}")
     finally:
