@@ -132,6 +132,13 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 
     Raises as `launch` does.
     """
+    with exits_refused(), _zero_exits_told():  # environments are made and reset from here on
+        with _begun(config, folder, resume=resume, stop=stop) as course:
+            yield course
+
+
+@contextlib.contextmanager
+def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
     ledger, config = Ledger(folder), resolved(config)
     train, test = read_instances(config)
@@ -327,7 +334,7 @@ def _cluster(course: Course) -> Iterator[Cluster]:
 def _failures_noted(writer: RunWriter) -> Iterator[None]:
     """Leave a true status behind, whatever happens."""
     try:
-        with exits_refused(), _zero_exits_noted(writer):
+        with exits_refused(), _unfinished_while(writer):
             yield
     except Interrupted as error:
         log.warning("%s", error)
@@ -357,19 +364,20 @@ def _note_failure(writer: RunWriter, message: str, state: State = "failed") -> N
             writer.set_status(replace(writer.status, state=state, message=message[:2000], updated_at=time.time()))
 
 
-_unfinished: list[RunWriter] = []  # of the runs that this process is at
+_unfinished: list[RunWriter] = []  # of the runs that this process is at, and that are its own by now
+_at_work: list[object] = []  # one for each run, from before its environment is made for the first time
 _restore: list[Callable[[int], NoReturn]] = []  # what `os._exit` is otherwise
 
 
 @contextlib.contextmanager
-def _zero_exits_noted(writer: RunWriter) -> Iterator[None]:
+def _zero_exits_told() -> Iterator[None]:
     """Keep `os._exit(0)` from ending a run that is not done with the exit code of one that is.
 
     It cannot be caught, so it is stood in for while a run is unfinished. What ends the process from C is not noticed:
     that would take a parent process, through which every signal, lock and limit of the run had to go. Grids have one,
     the supervisor; elsewhere the run's owner is seen to be gone.
     """
-    if not _unfinished:
+    if not _at_work:
         end, owner = os._exit, os.getpid()
 
         def told(code: int) -> NoReturn:
@@ -383,13 +391,24 @@ def _zero_exits_noted(writer: RunWriter) -> Iterator[None]:
 
         _restore.append(end)
         os._exit = told  # type: ignore[assignment]
+    mine = object()
+    _at_work.append(mine)
+    try:
+        yield
+    finally:
+        _at_work.remove(mine)
+        if not _at_work:
+            os._exit = _restore.pop()  # type: ignore[assignment]
+
+
+@contextlib.contextmanager
+def _unfinished_while(writer: RunWriter) -> Iterator[None]:
+    """Have an end of the process noted in this run's status, too."""
     _unfinished.append(writer)
     try:
         yield
     finally:
         _unfinished.remove(writer)
-        if not _unfinished:
-            os._exit = _restore.pop()  # type: ignore[assignment]
 
 
 speaking: contextvars.ContextVar[Path | None] = contextvars.ContextVar("speaking", default=None)
