@@ -42,7 +42,7 @@ from space_dist.importing import PYTHON
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_device, torch_probes
-from space_dist.ledger import Ledger, RunWriter, State, Status, decode_checkpoint
+from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
@@ -132,9 +132,9 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 
     Raises as `launch` does.
     """
-    with exits_refused(), _zero_exits_told():  # environments are made and reset from here on
-        with _begun(config, folder, resume=resume, stop=stop) as course:
-            yield course
+    # Environments are made and reset from here on.
+    with exits_refused(), _zero_exits_told(), _begun(config, folder, resume=resume, stop=stop) as course:
+        yield course
 
 
 @contextlib.contextmanager
@@ -194,6 +194,13 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
                 return before
             for sentence in damage:
                 log.warning("%s; computing it again from the last checkpoint", sentence)
+        if before.checkpoint is not None and before.format != FORMAT:
+            raise ConfigError(
+                f"{ledger.folder} was begun by an earlier version of space_dist (format {before.format} of its files; "
+                f"this version writes {FORMAT}), whose checkpoints, up to commit 2f6e945, lack the episodes in "
+                "progress: it can be evaluated and reported on, and not gone on with. Use another folder, or the "
+                "version that began it"
+            )
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
         status = replace(
             status, steps=before.steps, round=before.round, started_at=before.started_at,
@@ -247,6 +254,7 @@ def _status_in(ledger: Ledger) -> Status | None:
                 state="running", name="", seed=0, steps=about.get("steps", 0), budget_steps=0, round=checkpoint.round,
                 started_at=now, updated_at=now, checkpoint=file.name, identity=about.get("identity"),
                 fingerprint=about.get("fingerprint", {}), fingerprint_changed=about.get("fingerprint_changed", False),
+                format=checkpoint.format,
             )  # fmt: skip
     return None
 
