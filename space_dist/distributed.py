@@ -41,7 +41,18 @@ from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
-from space_dist.ray_watch import JOIN_SECONDS, SILENT_SECONDS, START_SECONDS, Started, bounded, parts, reach, watched
+from space_dist.ray_watch import (
+    JOIN_SECONDS,
+    SILENT_SECONDS,
+    START_SECONDS,
+    Note,
+    Started,
+    bounded,
+    nowhere,
+    parts,
+    reach,
+    watched,
+)
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
 from space_dist.walk import Walk
 
@@ -138,9 +149,12 @@ class RayCluster:
     for its actors, the run goes on with fewer. Raises SpaceDistError if Ray cannot be reached or has no room.
     """
 
-    def __init__(self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None) -> None:
-        """As `join_ray` for `heed`."""
-        self._config, self._resources, self._setup, self._heed = config, config.resources, setup, heed
+    def __init__(
+        self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+    ) -> None:
+        """As `join_ray` for `heed` and `note`."""
+        self._config, self._resources, self._setup = config, config.resources, setup
+        self._heed, self._note = heed, note
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by seat
         self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
@@ -154,9 +168,9 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, resources.workers + 1, self._heed)
+        found = join_ray(resources.address, resources.workers + 1, self._heed, self._note)
         self._session = found["session_dir"] if resources.address == "local" else None
-        self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down))
+        self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down, note=self._note))
         try:
             self._setup_piece = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
@@ -467,12 +481,15 @@ class _Driver(JobConfig):
         return super()._serialize()
 
 
-def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def join_ray(
+    address: str, cpus: int, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+) -> dict[str, Any]:  # fmt: skip
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
     not enough on a busy machine. While that lasts, `heed` is called, and may raise what ends it. Raises SpaceDistError
-    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that.
+    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that, and
+    `note` is told.
     """
     where = f"at {address!r} (resources.address, or --address)"
     ours = address == "local"
@@ -487,7 +504,7 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
         try:
             if not ours:
                 reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, heed)
-            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started):
+            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started, note=note):
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
                     job_config=_Driver(), **options,
@@ -510,7 +527,9 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
 
 
 @contextlib.contextmanager
-def attended(found: Mapping[str, Any], address: str, *, gone: bool, leave: Callable[[], None]) -> Iterator[None]:
+def attended(
+    found: Mapping[str, Any], address: str, *, gone: bool, leave: Callable[[], None], note: Note = nowhere
+) -> Iterator[None]:  # fmt: skip
     """Watch the Ray that `join_ray` `found` at `address`; see `ray_watch.watched`. Afterwards none of ours is left.
 
     leave: shuts down or disconnects, once nobody watches any more: what ends on purpose has not died.
@@ -521,11 +540,11 @@ def attended(found: Mapping[str, Any], address: str, *, gone: bool, leave: Calla
     if started is not None:
         started.look()
     try:
-        with watched(places, where, started, gone=gone):
+        with watched(places, where, started, gone=gone, note=note):
             yield
     finally:
         late = f"the Ray {where} did not shut down in {SILENT_SECONDS:.0f} s. What was committed is intact"
-        with bounded(SILENT_SECONDS, late, started, Interrupted.exit_code):
+        with bounded(SILENT_SECONDS, late, started, Interrupted.exit_code, note):
             leave()
         if started is not None:
             started.end()

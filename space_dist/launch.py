@@ -121,6 +121,11 @@ class Course:
         """Raise Interrupted, before the first round, if it was asked to stop."""
         _stop_if_asked(self.writer, self.stop)
 
+    def note(self, sentence: str, code: int) -> None:
+        """Have the status say why this process ends, with this exit code, from another thread than this one."""
+        with contextlib.suppress(LedgerError, RunLockedError):
+            self.writer.note_end("interrupted" if code == Interrupted.exit_code else "failed", sentence)
+
     def finished(self) -> Outcome:
         """How it ended, once MLflow's mirror has what it can have."""
         return replace(self.outcome, tracking_warning=_final_push(self.config, self.outcome.ledger, self.pusher))
@@ -334,7 +339,7 @@ def _cluster(course: Course) -> Iterator[Cluster]:
 
     with contextlib.ExitStack() as stack:
         with course.stop.standing():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed))
+            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed, course.note))
         yield cluster
 
 

@@ -680,6 +680,14 @@ class RunWriter:
         with _clear_errors(self.ledger.folder), self._lock.held():
             self._write_status(status)
 
+    def note_end(self, state: State, message: str) -> None:
+        """Say why the process ends, from another thread than the one that works: over no newer status, and no end."""
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            if self.status is not None and self.status.state == "running":
+                self._write_status(
+                    dataclasses.replace(self.status, state=state, message=message, updated_at=time.time())
+                )  # fmt: skip
+
     def _write_status(self, status: Status) -> None:
         files = {**(self.status.files if self.status else {}), **self._files, **status.files}
         status = dataclasses.replace(status, files=files)
