@@ -11,6 +11,7 @@ actors that are up; one that is being replaced joins when it is.
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import logging
 import os
 import shutil
@@ -36,9 +37,10 @@ from ray.util.placement_group import PlacementGroup, placement_group, placement_
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import SETTINGS, has_reference_cpu, numpy_digest
+from space_dist.arithmetic import SETTINGS, digest, has_reference_cpu, numpy_digest, scipy_probes
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
+from space_dist.envs import BULLET_IDS
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
 from space_dist.ray_watch import (
@@ -69,12 +71,45 @@ _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 log = logging.getLogger("space_dist")
 
 
+def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[str, ...]:
+    """What decides the bits that an actor computes, as `computed` knows it, beside those of the environment itself."""
+    if central:
+        also = {"scipy": config.curriculum.kind in ("spdrl", "alp_gmm"),
+                "scikit-learn": config.curriculum.kind == "alp_gmm"}  # fmt: skip
+    else:
+        from space_dist.learner import is_mlp  # torch, which actors of such policies never import
+
+        also = {"torch": not is_mlp(config.learner, setup.make_env(1).observation_space),
+                "pybullet": config.env.id in BULLET_IDS}  # fmt: skip
+    return ("numpy", *(name for name, used in also.items() if used))
+
+
+def computed(parts: Iterable[str]) -> dict[str, str]:
+    """By part, a digest of what this process computes with it; of libraries without kernels of their own, the version.
+
+    NumPy's, which is of the system's libm as well, takes some milliseconds, as do SciPy's and torch's once imported.
+    """
+    found = {}
+    for part in parts:
+        if part == "numpy":
+            found[part] = numpy_digest()
+        elif part == "scipy":
+            found[part] = digest(scipy_probes())
+        elif part == "torch":
+            from space_dist.learner import torch_probes  # likewise
+
+            found[part] = digest(torch_probes())
+        else:
+            found[part] = importlib.metadata.version(part)
+    return found
+
+
 class _Timed:
     """An actor's side of a call: what it answers, and how long that took."""
 
-    def ready(self) -> str:
-        """Answers once the actor is up: with what its arithmetic computes."""
-        return numpy_digest()
+    def ready(self, parts: Sequence[str]) -> dict[str, str]:
+        """Answers once the actor is up: with what its arithmetic computes, as `computed` says."""
+        return computed(parts)
 
     def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
         """Seconds, and the answer: one object, or each of `several`."""
@@ -155,6 +190,7 @@ class RayCluster:
         """As `join_ray` for `heed` and `note`."""
         self._config, self._resources, self._setup = config, config.resources, setup
         self._heed, self._note = heed, note
+        self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by seat
         self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
@@ -384,7 +420,8 @@ class RayCluster:
                 if seat == _CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
-            self._starting[seat] = (self._actors[seat].ready.remote(), time.monotonic())
+            parts = self._computing[seat == _CENTRAL]
+            self._starting[seat] = (self._actors[seat].ready.remote(parts), time.monotonic())
 
     def _replace(self, seats: Iterable[int]) -> None:
         for seat in seats:
@@ -405,7 +442,7 @@ class RayCluster:
                 except RayError as error:
                     self._retry_start(seat, error)
                 else:
-                    _refuse_other_arithmetic(seat, found)
+                    refuse_other_arithmetic(seat, found)
                     del self._starting[seat]
                     self._failed_starts[seat] = 0
             elif time.monotonic() - since > self._resources.first_answer_seconds:
@@ -578,13 +615,15 @@ def remove_session(folder: str | None) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _refuse_other_arithmetic(seat: int, found: str) -> None:
-    """Raise SpaceDistError for an actor whose results would depend on its being there."""
-    if found != numpy_digest():
+def refuse_other_arithmetic(seat: int, found: Mapping[str, str]) -> None:
+    """Raise SpaceDistError for an actor whose results, `found` by part, would depend on its being there."""
+    here = computed(found)
+    other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
+    if other:
         raise SpaceDistError(
-            f"{_name(seat)} computes other bits ({found}) than this process ({numpy_digest()}): its node has another "
-            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
-            "nodes of one kind (resources.address, or the cluster's own constraints)"
+            f"{_name(seat)} computes other bits than this process with {', '.join(other)}: its node has another kind "
+            "of CPU, or other library versions, and results would depend on who computes what. Keep the run to nodes "
+            "of one kind (resources.address, or the cluster's own constraints)"
         )
 
 

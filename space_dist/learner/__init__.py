@@ -30,6 +30,7 @@ from space_dist.learner.coupled import CoupledLearner
 from space_dist.learner.elementary import torch_probes  # and replaces kernels of torch
 from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
+from space_dist.learner.networks import is_mlp
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
 from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
@@ -104,6 +105,7 @@ __all__ = [
     "OnPolicyLearner",
     "PopulationLearner",
     "Update",
+    "is_mlp",
     "learn_together",
     "make_ensemble",
     "make_learner",
