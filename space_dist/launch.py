@@ -41,7 +41,7 @@ from space_dist.files import LogFile, appending, in_words
 from space_dist.importing import PYTHON
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
-from space_dist.learner import refuse_device, torch_probes
+from space_dist.learner import refuse_machine, torch_probes
 from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
@@ -148,7 +148,7 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
     ledger, config = Ledger(folder), resolved(config)
     train, test = read_instances(config)
     setup = make_setup(config, train, test)
-    refuse_device(config.device)
+    refuse_machine(config)
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:

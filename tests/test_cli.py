@@ -102,6 +102,18 @@ def test_a_mistake_is_one_clear_sentence_and_exit_code_2(
     assert not Path("run").exists()  # nothing was begun
 
 
+@pytest.mark.parametrize("setting", ["learner.update=lean", "engine=population"])
+def test_numba_that_may_not_compile_is_told_before_anything_begins(setting: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(setting, out=tmp_path / "run"))]
+    variables = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE, env=variables)
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    for part in ("NUMBA_DISABLE_JIT is set", setting.replace("=", ": "), "unset it, or use learner.update: stock"):
+        assert part in line
+    assert not (tmp_path / "run").exists()
+
+
 MODULES = {
     "fails_to_import": "raise ImportError('no such library')",
     "divides_at_import": "1 / 0",
