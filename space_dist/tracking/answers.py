@@ -36,7 +36,7 @@ def bound_answers() -> None:
         def send(self, request: requests.PreparedRequest, stream: bool = False, *rest: Any, **named: Any) -> Any:
             limit = SECONDS + (super_len(request.body) if request.body else 0) / _BYTES_A_SECOND
             # A redirection is another request, a copy of the one before, with which it has its hooks in common.
-            hooks: dict[str, Any] = request.hooks  # type: ignore[assignment]
+            hooks: Any = request.hooks
             until: float = hooks.setdefault(_UNTIL, time.monotonic() + limit)
             answers: queue.SimpleQueue[requests.Response | Exception] = queue.SimpleQueue()
 
