@@ -3,7 +3,7 @@
 Written from docs/algorithm.md, with NumPy, the standard library and a reader of YAML, and nothing of space_dist:
 whoever trusts neither its code nor its tests can read this file in five minutes. Start values come from values.jsonl,
 what was trained on from curriculum.jsonl, gradient steps and what the run said of itself from metrics.jsonl, settings
-from config.yaml.
+from config.yaml, and how much of these files counts from status.json.
 
 Exit code 0: all decisions are as they should be. 1: the first that is not is printed. 2: this cannot be audited.
 """
@@ -57,10 +57,31 @@ class Run(NamedTuple):
 # ---- reading ---------------------------------------------------------------------------------------------------------
 
 
-def rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file, each of which ends with a CRC-32 of what stands before it; an unfinished last one is none."""
+def committed(folder: Path) -> dict[str, int] | None:
+    """How many bytes of each file a checkpoint covers, as status.json says; None where there is no such file.
+
+    What is behind them is of a run that is being written, or was killed: its files do not yet say the same.
+    """
+    try:
+        sizes = json.loads((folder / "status.json").read_bytes())["committed"]
+        found = {str(name): int(size) for name, size in sizes.items()}
+    except FileNotFoundError:
+        return None
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise NotAuditableError(f"{folder / 'status.json'} is damaged") from None
+    if not found.get("metrics.jsonl"):
+        raise NotAuditableError(f"{folder} has committed nothing yet: no checkpoint was written")
+    return found
+
+
+def rows(path: Path, sizes: dict[str, int] | None) -> list[dict[str, Any]]:
+    """The rows of a file, each of which ends with a CRC-32 of what stands before it; an unfinished last one is none.
+
+    sizes: see `committed`; None for all there is.
+    """
     found = []
-    for number, line in enumerate(path.read_bytes().splitlines(keepends=True), start=1):
+    content = path.read_bytes()[: None if sizes is None else sizes.get(path.name, 0)]
+    for number, line in enumerate(content.splitlines(keepends=True), start=1):
         if not line.endswith(b"\n"):
             break
         body, _, crc = line.rpartition(b',"crc":"')
@@ -81,11 +102,12 @@ def read(folder: Path) -> Run:
     for name in ("config.yaml", "instances_train.csv", "values.jsonl", "curriculum.jsonl", "metrics.jsonl"):
         if not (folder / name).is_file():
             raise NotAuditableError(f"{folder} has no {name}")
+    sizes = committed(folder)  # before the files: a run that goes on only adds to them
     config = YAML(typ="safe").load((folder / "config.yaml").read_text())
     settings = config["curriculum"]
     with (folder / "instances_train.csv").open(newline="") as file:
         table = sorted(csv.DictReader(file), key=lambda row: int(row["id"]))
-    scored = rows(folder / "values.jsonl")
+    scored = rows(folder / "values.jsonl", sizes)
     if [row["iteration"] for row in scored] != list(range(len(scored))) or not scored:
         raise NotAuditableError(
             f"{folder / 'values.jsonl'} does not hold the values of every decision from the first on"
@@ -93,13 +115,13 @@ def read(folder: Path) -> Run:
     bounds = np.array(scored[0]["low"]), np.array(scored[0]["high"])
     extra = [settings["column"]] if settings["kind"] == "manual" else []
     names = [name for name in table[0] if name != "id" and name not in extra]
-    complete = [row for row in rows(folder / "metrics.jsonl") if row["kind"] == "iteration" and row["complete"]]
+    complete = [row for row in rows(folder / "metrics.jsonl", sizes) if row["kind"] == "iteration" and row["complete"]]
     return Run(
         curriculum=settings, seed=config["seed"], ids=np.array([int(row["id"]) for row in table]),
         contexts=np.array([[float(row[name]) for name in names] for row in table]),
         columns={name: np.array([float(row[name]) for row in table]) for name in extra}, bounds=bounds,
         values=[(floats(row["after"]), floats(row["before"]) if "before" in row else None) for row in scored],
-        trained=[row["trained"] for row in rows(folder / "curriculum.jsonl")], numbers=complete,
+        trained=[row["trained"] for row in rows(folder / "curriculum.jsonl", sizes)], numbers=complete,
     )  # fmt: skip
 
 

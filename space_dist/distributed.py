@@ -11,6 +11,7 @@ actors that are up; one that is being replaced joins when it is.
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import logging
 import os
 import shutil
@@ -36,12 +37,24 @@ from ray.util.placement_group import PlacementGroup, placement_group, placement_
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import SETTINGS, has_reference_cpu, numpy_digest
+from space_dist.arithmetic import SETTINGS, digest, has_reference_cpu, numpy_digest, scipy_probes
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
+from space_dist.envs import BULLET_IDS
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
 from space_dist.importing import folders_of_user, look_in
-from space_dist.ray_watch import JOIN_SECONDS, SILENT_SECONDS, START_SECONDS, Started, bounded, parts, reach, watched
+from space_dist.ray_watch import (
+    JOIN_SECONDS,
+    SILENT_SECONDS,
+    START_SECONDS,
+    Note,
+    Started,
+    bounded,
+    nowhere,
+    parts,
+    reach,
+    watched,
+)
 from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
 from space_dist.walk import Walk
 
@@ -58,12 +71,45 @@ _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 log = logging.getLogger("space_dist")
 
 
+def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[str, ...]:
+    """What decides the bits that an actor computes, as `computed` knows it, beside those of the environment itself."""
+    if central:
+        also = {"scipy": config.curriculum.kind in ("spdrl", "alp_gmm"),
+                "scikit-learn": config.curriculum.kind == "alp_gmm"}  # fmt: skip
+    else:
+        from space_dist.learner import is_mlp  # torch, which actors of such policies never import
+
+        also = {"torch": not is_mlp(config.learner, setup.make_env(1).observation_space),
+                "pybullet": config.env.id in BULLET_IDS}  # fmt: skip
+    return ("numpy", *(name for name, used in also.items() if used))
+
+
+def computed(parts: Iterable[str]) -> dict[str, str]:
+    """By part, a digest of what this process computes with it; of libraries without kernels of their own, the version.
+
+    NumPy's, which is of the system's libm as well, takes some milliseconds, as do SciPy's and torch's once imported.
+    """
+    found = {}
+    for part in parts:
+        if part == "numpy":
+            found[part] = numpy_digest()
+        elif part == "scipy":
+            found[part] = digest(scipy_probes())
+        elif part == "torch":
+            from space_dist.learner import torch_probes  # likewise
+
+            found[part] = digest(torch_probes())
+        else:
+            found[part] = importlib.metadata.version(part)
+    return found
+
+
 class _Timed:
     """An actor's side of a call: what it answers, and how long that took."""
 
-    def ready(self) -> str:
-        """Answers once the actor is up: with what its arithmetic computes."""
-        return numpy_digest()
+    def ready(self, parts: Sequence[str]) -> dict[str, str]:
+        """Answers once the actor is up: with what its arithmetic computes, as `computed` says."""
+        return computed(parts)
 
     def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
         """Seconds, and the answer: one object, or each of `several`."""
@@ -138,9 +184,13 @@ class RayCluster:
     for its actors, the run goes on with fewer. Raises SpaceDistError if Ray cannot be reached or has no room.
     """
 
-    def __init__(self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None) -> None:
-        """As `join_ray` for `heed`."""
-        self._config, self._resources, self._setup, self._heed = config, config.resources, setup, heed
+    def __init__(
+        self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+    ) -> None:
+        """As `join_ray` for `heed` and `note`."""
+        self._config, self._resources, self._setup = config, config.resources, setup
+        self._heed, self._note = heed, note
+        self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by seat
         self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
@@ -154,9 +204,9 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, resources.workers + 1, self._heed)
+        found = join_ray(resources.address, resources.workers + 1, self._heed, self._note)
         self._session = found["session_dir"] if resources.address == "local" else None
-        self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down))
+        self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down, note=self._note))
         try:
             self._setup_piece = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
@@ -370,7 +420,8 @@ class RayCluster:
                 if seat == _CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
-            self._starting[seat] = (self._actors[seat].ready.remote(), time.monotonic())
+            parts = self._computing[seat == _CENTRAL]
+            self._starting[seat] = (self._actors[seat].ready.remote(parts), time.monotonic())
 
     def _replace(self, seats: Iterable[int]) -> None:
         for seat in seats:
@@ -391,7 +442,7 @@ class RayCluster:
                 except RayError as error:
                     self._retry_start(seat, error)
                 else:
-                    _refuse_other_arithmetic(seat, found)
+                    refuse_other_arithmetic(seat, found)
                     del self._starting[seat]
                     self._failed_starts[seat] = 0
             elif time.monotonic() - since > self._resources.first_answer_seconds:
@@ -467,12 +518,15 @@ class _Driver(JobConfig):
         return super()._serialize()
 
 
-def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def join_ray(
+    address: str, cpus: int, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+) -> dict[str, Any]:  # fmt: skip
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
     not enough on a busy machine. While that lasts, `heed` is called, and may raise what ends it. Raises SpaceDistError
-    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that.
+    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that, and
+    `note` is told.
     """
     where = f"at {address!r} (resources.address, or --address)"
     ours = address == "local"
@@ -487,7 +541,7 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
         try:
             if not ours:
                 reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, heed)
-            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started):
+            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started, note=note):
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
                     job_config=_Driver(), **options,
@@ -510,7 +564,9 @@ def join_ray(address: str, cpus: int, heed: Callable[[], None] = lambda: None) -
 
 
 @contextlib.contextmanager
-def attended(found: Mapping[str, Any], address: str, *, gone: bool, leave: Callable[[], None]) -> Iterator[None]:
+def attended(
+    found: Mapping[str, Any], address: str, *, gone: bool, leave: Callable[[], None], note: Note = nowhere
+) -> Iterator[None]:  # fmt: skip
     """Watch the Ray that `join_ray` `found` at `address`; see `ray_watch.watched`. Afterwards none of ours is left.
 
     leave: shuts down or disconnects, once nobody watches any more: what ends on purpose has not died.
@@ -521,11 +577,11 @@ def attended(found: Mapping[str, Any], address: str, *, gone: bool, leave: Calla
     if started is not None:
         started.look()
     try:
-        with watched(places, where, started, gone=gone):
+        with watched(places, where, started, gone=gone, note=note):
             yield
     finally:
         late = f"the Ray {where} did not shut down in {SILENT_SECONDS:.0f} s. What was committed is intact"
-        with bounded(SILENT_SECONDS, late, started, Interrupted.exit_code):
+        with bounded(SILENT_SECONDS, late, started, Interrupted.exit_code, note):
             leave()
         if started is not None:
             started.end()
@@ -559,13 +615,15 @@ def remove_session(folder: str | None) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _refuse_other_arithmetic(seat: int, found: str) -> None:
-    """Raise SpaceDistError for an actor whose results would depend on its being there."""
-    if found != numpy_digest():
+def refuse_other_arithmetic(seat: int, found: Mapping[str, str]) -> None:
+    """Raise SpaceDistError for an actor whose results, `found` by part, would depend on its being there."""
+    here = computed(found)
+    other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
+    if other:
         raise SpaceDistError(
-            f"{_name(seat)} computes other bits ({found}) than this process ({numpy_digest()}): its node has another "
-            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
-            "nodes of one kind (resources.address, or the cluster's own constraints)"
+            f"{_name(seat)} computes other bits than this process with {', '.join(other)}: its node has another kind "
+            "of CPU, or other library versions, and results would depend on who computes what. Keep the run to nodes "
+            "of one kind (resources.address, or the cluster's own constraints)"
         )
 
 

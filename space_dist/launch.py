@@ -41,8 +41,8 @@ from space_dist.files import LogFile, appending, in_words
 from space_dist.importing import PYTHON
 from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
-from space_dist.learner import refuse_device, torch_probes
-from space_dist.ledger import Ledger, RunWriter, State, Status, decode_checkpoint
+from space_dist.learner import refuse_machine, torch_probes
+from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.place import absolute_uri, private_ray
 from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
@@ -121,6 +121,11 @@ class Course:
         """Raise Interrupted, before the first round, if it was asked to stop."""
         _stop_if_asked(self.writer, self.stop)
 
+    def note(self, sentence: str, code: int) -> None:
+        """Have the status say why this process ends, with this exit code, from another thread than this one."""
+        with contextlib.suppress(LedgerError, RunLockedError):
+            self.writer.note_end("interrupted" if code == Interrupted.exit_code else "failed", sentence)
+
     def finished(self) -> Outcome:
         """How it ended, once MLflow's mirror has what it can have."""
         return replace(self.outcome, tracking_warning=_final_push(self.config, self.outcome.ledger, self.pusher))
@@ -132,11 +137,18 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 
     Raises as `launch` does.
     """
+    # Environments are made and reset from here on.
+    with exits_refused(), _zero_exits_told(), _begun(config, folder, resume=resume, stop=stop) as course:
+        yield course
+
+
+@contextlib.contextmanager
+def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
     ledger, config = Ledger(folder), resolved(config)
     train, test = read_instances(config)
     setup = make_setup(config, train, test)
-    refuse_device(config.device)
+    refuse_machine(config)
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
@@ -187,6 +199,13 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
                 return before
             for sentence in damage:
                 log.warning("%s; computing it again from the last checkpoint", sentence)
+        if before.checkpoint is not None and before.format != FORMAT:
+            raise ConfigError(
+                f"{ledger.folder} was begun by an earlier version of space_dist (format {before.format} of its files; "
+                f"this version writes {FORMAT}), whose checkpoints, up to commit 2f6e945, lack the episodes in "
+                "progress: it can be evaluated and reported on, and not gone on with. Use another folder, or the "
+                "version that began it"
+            )
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
         status = replace(
             status, steps=before.steps, round=before.round, started_at=before.started_at,
@@ -240,6 +259,7 @@ def _status_in(ledger: Ledger) -> Status | None:
                 state="running", name="", seed=0, steps=about.get("steps", 0), budget_steps=0, round=checkpoint.round,
                 started_at=now, updated_at=now, checkpoint=file.name, identity=about.get("identity"),
                 fingerprint=about.get("fingerprint", {}), fingerprint_changed=about.get("fingerprint_changed", False),
+                format=checkpoint.format,
             )  # fmt: skip
     return None
 
@@ -319,7 +339,7 @@ def _cluster(course: Course) -> Iterator[Cluster]:
 
     with contextlib.ExitStack() as stack:
         with course.stop.standing():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed))
+            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed, course.note))
         yield cluster
 
 
@@ -327,7 +347,7 @@ def _cluster(course: Course) -> Iterator[Cluster]:
 def _failures_noted(writer: RunWriter) -> Iterator[None]:
     """Leave a true status behind, whatever happens."""
     try:
-        with exits_refused(), _zero_exits_noted(writer):
+        with exits_refused(), _unfinished_while(writer):
             yield
     except Interrupted as error:
         log.warning("%s", error)
@@ -357,19 +377,20 @@ def _note_failure(writer: RunWriter, message: str, state: State = "failed") -> N
             writer.set_status(replace(writer.status, state=state, message=message[:2000], updated_at=time.time()))
 
 
-_unfinished: list[RunWriter] = []  # of the runs that this process is at
+_unfinished: list[RunWriter] = []  # of the runs that this process is at, and that are its own by now
+_at_work: list[object] = []  # one for each run, from before its environment is made for the first time
 _restore: list[Callable[[int], NoReturn]] = []  # what `os._exit` is otherwise
 
 
 @contextlib.contextmanager
-def _zero_exits_noted(writer: RunWriter) -> Iterator[None]:
+def _zero_exits_told() -> Iterator[None]:
     """Keep `os._exit(0)` from ending a run that is not done with the exit code of one that is.
 
     It cannot be caught, so it is stood in for while a run is unfinished. What ends the process from C is not noticed:
     that would take a parent process, through which every signal, lock and limit of the run had to go. Grids have one,
     the supervisor; elsewhere the run's owner is seen to be gone.
     """
-    if not _unfinished:
+    if not _at_work:
         end, owner = os._exit, os.getpid()
 
         def told(code: int) -> NoReturn:
@@ -383,13 +404,24 @@ def _zero_exits_noted(writer: RunWriter) -> Iterator[None]:
 
         _restore.append(end)
         os._exit = told  # type: ignore[assignment]
+    mine = object()
+    _at_work.append(mine)
+    try:
+        yield
+    finally:
+        _at_work.remove(mine)
+        if not _at_work:
+            os._exit = _restore.pop()  # type: ignore[assignment]
+
+
+@contextlib.contextmanager
+def _unfinished_while(writer: RunWriter) -> Iterator[None]:
+    """Have an end of the process noted in this run's status, too."""
     _unfinished.append(writer)
     try:
         yield
     finally:
         _unfinished.remove(writer)
-        if not _unfinished:
-            os._exit = _restore.pop()  # type: ignore[assignment]
 
 
 speaking: contextvars.ContextVar[Path | None] = contextvars.ContextVar("speaking", default=None)

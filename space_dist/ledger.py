@@ -56,7 +56,8 @@ State = Literal["running", "interrupted", "failed", "done"]
 METRICS, TIMING, CURRICULUM, VALUES = "metrics.jsonl", "timing.jsonl", "curriculum.jsonl", "values.jsonl"
 ROW_FILES = (METRICS, TIMING, CURRICULUM, VALUES)
 MOST_VALUED = 10_000  # instances whose start values are kept for every decision: some 50 kB a row
-FORMAT = 1
+FORMAT = 2  # 1: checkpoints without the episodes in progress. Such runs are read, and not gone on with
+READABLE = (1, FORMAT)
 KEPT_CHECKPOINTS = 2
 LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
 HEARTBEAT_SECONDS = 10.0
@@ -103,6 +104,7 @@ class Checkpoint:
     arrays: Mapping[str, NDArray[Any]]
     data: Mapping[str, Any]
     segments: tuple[Segment, ...] = ()
+    format: int = FORMAT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,8 +196,11 @@ class Ledger:
             crc = data.pop("crc")
             if crc != zlib.crc32(json.dumps(data, sort_keys=True).encode()):
                 raise ValueError("checksum")
-            if data["format"] != FORMAT:
-                raise LedgerError(f"{self.status_file} has format {data['format']}; this version reads format {FORMAT}")
+            if data["format"] not in READABLE:
+                raise LedgerError(
+                    f"{self.status_file} has format {data['format']}; this version reads formats "
+                    f"{' and '.join(map(str, READABLE))}"
+                )
             status = Status(**data)
             if status.checkpoint is not None and not _CHECKPOINT.fullmatch(status.checkpoint):
                 raise ValueError("it names what is no checkpoint")
@@ -345,7 +350,8 @@ def find_ledgers(paths: list[Path]) -> list[Ledger]:
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """An uncompressed npz; its `meta` names a SHA-256 over every array and all data."""
     segments = [[segment.first, segment.count, segment.sha256] for segment in checkpoint.segments]
-    meta = {"round": checkpoint.round, "data": dict(checkpoint.data), "segments": segments, "format": FORMAT}
+    meta = {"round": checkpoint.round, "data": dict(checkpoint.data), "segments": segments}
+    meta["format"] = checkpoint.format
     meta["sha256"] = _digest(meta, checkpoint.arrays)
     buffer = io.BytesIO()
     encoded = np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)
@@ -362,10 +368,10 @@ def decode_checkpoint(content: bytes) -> Checkpoint:
             raise ValueError("it holds what checkpoints do not")
         arrays = {name.removeprefix(_ARRAY): array for name, array in arrays.items()}
         written = meta.pop("sha256")
-        if meta["format"] != FORMAT or written != _digest(meta, arrays):
+        if meta["format"] not in READABLE or written != _digest(meta, arrays):
             raise ValueError("checksum")
         segments = tuple(_checked_segment(*segment) for segment in meta["segments"])
-        return Checkpoint(_count(meta["round"], "round"), arrays, dict(meta["data"]), segments)
+        return Checkpoint(_count(meta["round"], "round"), arrays, dict(meta["data"]), segments, meta["format"])
 
 
 def _decode_arrays(content: bytes) -> dict[str, NDArray[Any]]:
@@ -673,6 +679,14 @@ class RunWriter:
             )
         with _clear_errors(self.ledger.folder), self._lock.held():
             self._write_status(status)
+
+    def note_end(self, state: State, message: str) -> None:
+        """Say why the process ends, from another thread than the one that works: over no newer status, and no end."""
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            if self.status is not None and self.status.state == "running":
+                self._write_status(
+                    dataclasses.replace(self.status, state=state, message=message, updated_at=time.time())
+                )  # fmt: skip
 
     def _write_status(self, status: Status) -> None:
         files = {**(self.status.files if self.status else {}), **self._files, **status.files}

@@ -14,9 +14,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -498,16 +497,3 @@ def find_grid(path: Path, root: Path) -> Grid:
             "(--root names another root)"
         )
     return grid
-
-
-def find_grids(paths: Iterable[Path]) -> list[Grid]:
-    """Every grid among and below `paths`, in order, each once."""
-    found: dict[Path, Grid] = {}
-    for path in paths:
-        if not path.is_dir():
-            continue
-        for folder, below, files in os.walk(path):
-            if MANIFEST in files:
-                below.clear()  # a grid holds runs, no grids
-                found[Path(folder).resolve()] = Grid(folder)
-    return [found[key] for key in sorted(found)]

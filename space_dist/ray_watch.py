@@ -32,10 +32,18 @@ OTHERS_GONE_SECONDS = 45.0  # that another's is: its head may come back; after 6
 _ASK_SECONDS = 10.0  # for one answer
 _PAUSE_SECONDS = 2.0
 _LOOK_SECONDS = 10.0  # between two looks at which processes a Ray of our own has
+_NOTE_SECONDS = 5.0  # that it may take to note why the process ends
 _END_SECONDS = 5.0  # that Ray's own processes get to end by themselves
 _GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\x00\x00\x00\x04\x00\x00\x00\x00\x00"
 
+Note = Callable[[str, int], None]
+"""Puts on record why, and with which exit code, the process ends. Called from a thread of its own."""
+
 log = logging.getLogger("space_dist")
+
+
+def nowhere(sentence: str, code: int) -> None:
+    """A `Note` of whoever keeps no record."""
 
 
 def asked(address: str, seconds: float = _ASK_SECONDS) -> Literal["answers", "silent", "gone"]:
@@ -105,10 +113,10 @@ def _is_of_ray(process: psutil.Process) -> bool:
 
 @contextlib.contextmanager
 def bounded(
-    seconds: float, sentence: str, started: Started | None, code: int = SpaceDistError.exit_code
+    seconds: float, sentence: str, started: Started | None, code: int = SpaceDistError.exit_code, note: Note = nowhere
 ) -> Iterator[None]:
     """End the process with `sentence` and `code` if the block takes longer: Ray itself cannot be interrupted."""
-    timer = threading.Timer(seconds, _end, (sentence, started, code))
+    timer = threading.Timer(seconds, _end, (sentence, started, code, note))
     timer.daemon = True
     timer.start()
     try:
@@ -118,14 +126,16 @@ def bounded(
 
 
 @contextlib.contextmanager
-def watched(places: Mapping[str, str], where: str, started: Started | None, *, gone: bool) -> Iterator[None]:
+def watched(
+    places: Mapping[str, str], where: str, started: Started | None, *, gone: bool, note: Note = nowhere
+) -> Iterator[None]:  # fmt: skip
     """Ask the parts of a Ray, `places` (name -> HOST:PORT), all the while; end the process with 75 if one hangs.
 
     where: of which Ray, for people. started: what it consists of, if it is our own, which is then killed. gone: whether
-    one that nobody listens at any more is the end, too.
+    one that nobody listens at any more is the end, too. note: is told of the end.
     """
     over = threading.Event()
-    threading.Thread(target=_watch, args=(places, where, started, gone, over), daemon=True).start()
+    threading.Thread(target=_watch, args=(places, where, started, gone, over, note), daemon=True).start()
     try:
         yield
     finally:
@@ -133,7 +143,7 @@ def watched(places: Mapping[str, str], where: str, started: Started | None, *, g
 
 
 def _watch(
-    places: Mapping[str, str], where: str, started: Started | None, gone: bool, over: threading.Event
+    places: Mapping[str, str], where: str, started: Started | None, gone: bool, over: threading.Event, note: Note
 ) -> None:  # fmt: skip
     """The clock counts at most what asking takes: a process that was itself stopped, or slept, blames nobody."""
     limits = {"silent": SILENT_SECONDS, "gone": GONE_SECONDS if started else OTHERS_GONE_SECONDS}
@@ -156,16 +166,23 @@ def _watch(
                 did = "has died" if answer == "gone" else f"has not answered anything for {waited:.0f} s"
                 _end(
                     f"{name} of the Ray {where} {did}. What was committed is intact; --resume continues", started,
-                    Interrupted.exit_code,
+                    Interrupted.exit_code, note,
                 )  # fmt: skip
 
 
-def _end(sentence: str, started: Started | None, code: int) -> None:
-    """End the process from another thread than the one that waits, which nothing could wake."""
+def _end(sentence: str, started: Started | None, code: int, note: Note) -> None:
+    """End the process from another thread than the one that waits, which nothing could wake.
+
+    What is noted is waited for a little: who waits for Ray may be in the middle of a write to a disk that hangs as
+    well, and holds the ledger's lock then. The status stays `running` in that case, and its owner is seen to be gone.
+    """
     try:
         log.error("%s", sentence)
         with contextlib.suppress(OSError, ValueError):
             print(f"space-dist: {sentence}", file=sys.stderr, flush=True)
+        noting = threading.Thread(target=note, args=(sentence, code), daemon=True)
+        noting.start()
+        noting.join(_NOTE_SECONDS)
         if started is not None:
             started.end(0.0)
     finally:

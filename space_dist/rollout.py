@@ -394,9 +394,9 @@ def collect(
             put(following, time, step.observations)
         ended = np.flatnonzero(terminated[time] | truncated[time])
         table.end(ended, time, step.success)
+        if table.overdue(time + 1, env.horizon):
+            raise _endless(env)
         put(current, slice(None), step.observations)
-    if (table.lengths(length)[table.runs] >= env.horizon).any():
-        raise _endless(env)
     stored, lasts = np.stack(actions), concatenate(last)
     owners = np.nonzero(truncated[:length])[1] // slots  # of each last observation
     told, unfinished = table.episodes(len(rollouts)), table.unfinished(len(rollouts), np.stack(executed))
@@ -585,11 +585,19 @@ class _EpisodeTable:
         self.runs = self._starts < 0
         self.actions = _side_by_side([one.actions for one in known], slots)
         self.ended = 0
+        self._due = 0  # no running episode is as long as the horizon before this step
         self._ended: list[tuple[Any, ...]] = []  # in the order of the fields of `Episodes`
 
     def lengths(self, time: int) -> IntArray:
         """`(n_slots,)` steps that the running episodes have made, before step `time` of this round."""
         return time - self._starts
+
+    def overdue(self, time: int, horizon: int) -> bool:
+        """Whether an episode runs on that has made `horizon` steps before step `time` of this round."""
+        if time < self._due:  # looked at about once a horizon: what begins later is due later
+            return False
+        self._due = int(self._starts[self.runs].min(initial=time)) + horizon
+        return time >= self._due
 
     def begin(self, slots: IntArray, ids: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64], time: int) -> None:
         self._ids[slots], self.contexts[slots], self.seeds[slots] = ids, contexts, seeds

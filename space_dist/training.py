@@ -169,7 +169,7 @@ def _failures_explained(config: RunConfig, what: str) -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(f"env.id {config.env.id!r}: {what} failed: {type(error).__name__}: {error}") from error
 
 

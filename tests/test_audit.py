@@ -200,6 +200,27 @@ def test_whoever_changes_the_ledger_is_found(run_of: Any, tmp_path: Path) -> Non
         Ledger(tmp_path / "flipped").rows(VALUES)
 
 
+def test_rows_that_no_checkpoint_covers_accuse_nobody(run_of: Any, tmp_path: Path) -> None:
+    """As a run's files are while it writes: the iteration's row is there, its values and the next set are not."""
+    run = run_of("abs")
+    being_written = shutil.copytree(run, tmp_path / "being_written")
+    row = next(row for row in reversed(Ledger(run).rows(METRICS)) if row["kind"] == "iteration" and row["complete"])
+    with (being_written / METRICS).open("ab") as file:
+        file.write(encode_row({**row, "iteration": row["iteration"] + 1}))
+    with (being_written / CURRICULUM).open("ab") as file:
+        file.write(encode_row({"iteration": row["iteration"] + 1, "steps": 0, "trained": [0]}))
+    assert audited(being_written) == (0, audited(run)[1].replace(str(run), str(being_written)))
+    (being_written / "status.json").unlink()  # then nothing says that these do not count
+    assert audited(being_written)[0] == 1
+    begun = shutil.copytree(run, tmp_path / "begun")
+    status = json.loads((begun / "status.json").read_text())
+    (begun / "status.json").write_text(json.dumps({**status, "committed": {}}))
+    assert "has committed nothing yet" in audited(begun)[1]
+    assert audited(begun)[0] == 2
+    (begun / "status.json").write_text("{")
+    assert audited(begun) == (2, f"audit: {begun / 'status.json'} is damaged\n")
+
+
 def test_what_cannot_be_audited_is_said(folder: Path, run_of: Any, tmp_path: Path) -> None:
     assert audited(tmp_path)[0] == 2
     headless = rewritten(run_of("abs"), tmp_path / "headless", VALUES, lambda rows: rows[1:])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from space_dist import cli
-from space_dist.cli import runs
+from space_dist.cli import runs, terminal
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from tests.patience import PATIENCE
@@ -100,6 +102,44 @@ def test_a_mistake_is_one_clear_sentence_and_exit_code_2(
     for part in said:
         assert part in text
     assert not Path("run").exists()  # nothing was begun
+
+
+@pytest.mark.parametrize("setting", ["learner.update=lean", "engine=population"])
+def test_numba_that_may_not_compile_is_told_before_anything_begins(setting: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(setting, out=tmp_path / "run"))]
+    variables = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE, env=variables)
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    for part in ("NUMBA_DISABLE_JIT is set", setting.replace("=", ": "), "unset it, or use learner.update: stock"):
+        assert part in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_output_that_does_not_block_is_waited_for_and_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    text = b"0123456789" * 30_000  # more than a pipe holds
+    output, read = terminal._Output(writing, "w"), bytearray()
+
+    def slowly() -> None:
+        while len(read) < len(text):
+            time.sleep(0.001)
+            read.extend(os.read(reading, 1 << 14))
+
+    reader = threading.Thread(target=slowly)
+    reader.start()
+    with io.BufferedWriter(output) as buffered:
+        buffered.write(text)
+        buffered.flush()
+        reader.join()
+        assert (read == text, output.lost) == (True, None)
+        monkeypatch.setattr(terminal, "_READER_SECONDS", 0.05)
+        while output.lost is None:  # nobody reads any more
+            assert output.write(text) > 0
+        assert isinstance(output.lost, TimeoutError)
+        assert output.write(text) == len(text)  # and is not waited for again
+    os.close(reading)
 
 
 MODULES = {

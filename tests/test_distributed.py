@@ -11,15 +11,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from space_dist import config as configs
+from space_dist.arithmetic import digest, scipy_probes
+from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from space_dist.place import private_ray
 from space_dist.training import learner_of, make_setup
 from tests.patience import PATIENCE
+from tests.test_learners import config_for, learner_section
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
@@ -220,3 +224,36 @@ def test_a_stop_request_ends_a_run_on_ray_with_a_checkpoint(reference: dict[str,
     assert (status.state, status.steps < 8192) == ("interrupted", True)
     launch(config(0), tmp_path, resume=True, stop=StopRequests())
     assert results(tmp_path) == reference
+
+
+@pytest.mark.usefixtures("cluster_class")  # imports it with settings for a Ray of our own
+@pytest.mark.parametrize(
+    ("env_id", "kind", "rollout", "central"),
+    [
+        ("tests.tiny_env:make", "space", (), ()),
+        ("tests.tiny_env:make_dict", "space", ("torch",), ()),
+        ("tests.tiny_env:make", "spdrl", (), ("scipy",)),
+        ("tests.tiny_env:make", "alp_gmm", (), ("scipy", "scikit-learn")),
+    ],
+)
+def test_actors_are_compared_by_all_that_they_compute_with(
+    env_id: str, kind: str, rollout: tuple[str, ...], central: tuple[str, ...], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    from space_dist import distributed
+
+    policy = {"policy": "MultiInputPolicy"} if env_id.endswith("dict") else {}
+    config = config_for(tmp_path, learner_section("ppo", **policy), env_id)
+    setup = make_setup(config, *read_instances(config))
+    section = type("Section", (), {"kind": kind})()
+    config = config.model_copy(update={"curriculum": section})
+    for wanted, is_central in ((rollout, False), (central, True)):
+        parts = distributed.computes_with(config, setup, central=is_central)
+        assert parts == ("numpy", *wanted)
+        found = distributed.computed(parts)
+        distributed.refuse_other_arithmetic(0, found)
+        for part in parts:
+            with pytest.raises(SpaceDistError, match=rf"computes other bits than this process with {part} \(0 there"):
+                distributed.refuse_other_arithmetic(0, {**found, part: "0"})
+    monkeypatch.setattr(distributed, "scipy_probes", lambda: iter([("qr", np.zeros(1))]))
+    assert distributed.computed(["scipy"]) != {"scipy": digest(scipy_probes())}

@@ -23,8 +23,9 @@ from space_dist.launch import launch, policy_of, read_instances
 from space_dist.learner import make_learner
 from space_dist.learner.networks import TorchPolicy
 from space_dist.learner.normaliser import Normaliser
-from space_dist.ledger import CURRICULUM, METRICS, Ledger, decode_checkpoint
+from space_dist.ledger import CURRICULUM, FORMAT, METRICS, Ledger, RunWriter, decode_checkpoint
 from space_dist.policy import MlpPolicy
+from space_dist.report import build_report, load_run
 from space_dist.rollout import Worker
 from space_dist.training import learner_of, make_setup
 from space_dist.walk import Walk
@@ -92,6 +93,41 @@ class StopAfter(StopRequests):
 def interrupted(config: RunConfig, folder: Path, rounds: int) -> None:
     with pytest.raises(Interrupted):
         launch(config, folder, resume=True, stop=StopAfter(rounds))
+
+
+def aged(folder: Path) -> None:
+    """Have a run's status and checkpoint be of format 1, whose checkpoints have no episodes in progress."""
+    ledger = Ledger(folder)
+    with RunWriter(ledger) as writer:
+        writer.status = ledger.status()
+        checkpoint = writer.restore()
+        assert checkpoint is not None
+        assert checkpoint.format == FORMAT
+        arrays = {name: array for name, array in checkpoint.arrays.items() if not name.startswith("unfinished/")}
+        about = {name: value for name, value in checkpoint.data.items() if name != "about"}
+        old = dataclasses.replace(checkpoint, arrays=arrays, data=about, format=1)
+        writer.commit(old, dataclasses.replace(ledger.status(), format=1))
+
+
+def test_a_run_of_an_earlier_format_is_read_and_not_gone_on_with(tmp_path: Path) -> None:
+    config = config_for(tmp_path, learner_section("ppo"))
+    out = tmp_path / "run"
+    interrupted(config, out, 3)
+    aged(out)
+    before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file() and file.name != "lock.json"}
+    words = r"begun by an earlier version of space_dist \(format 1 .* Use another folder, or the version that began it"
+    with pytest.raises(ConfigError, match=words):
+        launch(config, out, resume=True, stop=StopRequests())
+    assert {name: (out / name).read_bytes() for name in before} == before
+    assert policy_of(Ledger(out)).version == 3
+    assert load_run(Ledger(out)).status.format == 1
+    (out / "status.json").unlink()
+    with pytest.raises(ConfigError, match=words):
+        launch(config, out, resume=True, stop=StopRequests())
+    launch(config, tmp_path / "done", resume=True, stop=StopRequests())
+    aged(tmp_path / "done")
+    assert launch(config, tmp_path / "done", resume=True, stop=StopRequests()).already_done
+    assert build_report([Ledger(tmp_path / "done")], tmp_path / "report").table[0]["seeds finished"] == "1/1"
 
 
 def crashed(config: RunConfig, folder: Path, rounds: int) -> None:

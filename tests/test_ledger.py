@@ -275,8 +275,8 @@ def test_a_newer_format_is_named(ledger: Ledger, monkeypatch: pytest.MonkeyPatch
     with monkeypatch.context() as patch, RunWriter(ledger) as writer:
         as_dict = dataclasses.asdict
         patch.setattr(module.dataclasses, "asdict", lambda status: {**as_dict(status), **extra})
-        writer.set_status(status_of(3, format=2))
-    with pytest.raises(LedgerError, match="format 2; this version reads format 1"):
+        writer.set_status(status_of(3, format=3))
+    with pytest.raises(LedgerError, match="format 3; this version reads formats 1 and 2"):
         ledger.status()
 
 

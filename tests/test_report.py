@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from space_dist.report import (
     summarise,
 )
 from space_dist.report.figures import curriculum_shares
+from space_dist.report.tables import few_seeds
 from space_dist.seeding import Purpose, generator
 
 STARTED = 1_700_000_000.0
@@ -268,6 +270,19 @@ def test_two_configurations_of_three_seeds(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [float(row["test_return_iqm"]) for row in rows] == [-7.0, 3.0]
     assert [row["all_instances_reached_at"] for row in rows] == ["2000.0", "2000.0"]
+
+
+def test_a_report_says_of_few_seeds_what_the_docs_have_measured() -> None:
+    """Populations of which some seeds fail or end at a limit; docs/reports.md has the table of `coverage`."""
+    text = (Path(__file__).parent.parent / "docs/reports.md").read_text()
+    rows = re.findall(r"^\| ([^|]*(?:fail|at a limit)) \| (\d+) \| (\d+) \(", text, re.MULTILINE)
+    covered = {seeds: [int(share) for _, n, share in rows if n == seeds] for seeds in ("3", "5")}
+    assert [len(shares) for shares in covered.values()] == [4, 4]
+    three, five = (f"{min(shares)} to {max(shares)} %" for shares in covered.values())
+    (sentence,) = few_seeds({"a": 4})
+    assert f"an interval over three seeds covers {three}, one over five {five}." in sentence
+    half = [int(share) for name, _, share in rows if name == "half fail"]
+    assert f"{min(half)}\nto {max(half)} % are covered at any number of seeds up to 20" in text
 
 
 def test_what_is_drawn_is_what_was_measured(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from space_dist.curricula import Selection
 from space_dist.envs import ContextObservation, make_batched
 from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
 from space_dist.envs.observations import distinct
+from space_dist.errors import SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.learner import make_learner
 from space_dist.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
@@ -665,6 +666,37 @@ def test_outcomes_are_the_same_whatever_is_measured_beside_them(env_id: str, nor
         together = evaluate(env, [again[index] for index in chosen])
         assert all(same(outcomes, alone[index]) for outcomes, index in zip(together, chosen, strict=True))
     assert not same(alone[0], alone[1])
+
+
+class Unpunctual(Countdown):
+    """Ends its episodes, but two steps behind its horizon."""
+
+    made = 0
+
+    def __init__(self, n_slots: int) -> None:
+        super().__init__(n_slots)
+        self.horizon -= 2
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        self.made += 1
+        step = super().step(actions)
+        late = self.time >= self.horizon + 2
+        self.ready = ~(step.terminated | late)
+        return dataclasses.replace(step, truncated=late)
+
+
+def test_an_episode_beyond_the_horizon_is_noticed_at_its_step() -> None:
+    env = Unpunctual(2)
+    slot, policy = Stage(env), weights_for(2, 1)  # type: ignore[arg-type]
+    rollout = Rollout(policy, select(np.array([[2.0], [100.0]])), 0, 0.9, seed=0, round=0, shard=0)
+    with pytest.raises(SpaceDistError, match="after its horizon of 3 steps, neither terminated nor truncated"):
+        collect(slot, [rollout], length=40)
+    assert env.made == 3
+    (shard,) = collect(slot, [rollout], length=2)  # and where it has run since the round before
+    again = dataclasses.replace(rollout, round=1, unfinished=shard.unfinished)
+    with pytest.raises(SpaceDistError, match="after its horizon of 3 steps"):
+        collect(slot, [dataclasses.replace(again, policy=dataclasses.replace(policy, version=1))], length=40)
+    assert env.made == 3 + 2 + 1
 
 
 def test_only_equals_act_side_by_side() -> None:

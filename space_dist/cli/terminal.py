@@ -12,9 +12,13 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import contextlib
+import errno
 import io
+import select
 import sys
 from typing import Any
+
+_READER_SECONDS = 60.0  # without reading, after which the reader of an output that does not block is taken to have left
 
 
 class _Output(io.FileIO):
@@ -26,12 +30,22 @@ class _Output(io.FileIO):
     lost: OSError | None = None
 
     def write(self, data: Any, /) -> int:
-        if self.lost is None:
+        while self.lost is None:
             try:
-                return super().write(data) or 0
+                written = super().write(data)
+                if written is not None:
+                    return written
+                self._await_room()
             except OSError as error:
                 self.lost = error
         return memoryview(data).nbytes
+
+    def _await_room(self) -> None:
+        """Where the output does not block, and its reader is slow. Raises OSError for one that reads nothing more."""
+        waiting = select.poll()
+        waiting.register(self.fileno(), select.POLLOUT)
+        if not waiting.poll(_READER_SECONDS * 1000.0):
+            raise TimeoutError(errno.ETIMEDOUT, f"its reader has read nothing for {_READER_SECONDS:.0f} s")
 
 
 _outputs: dict[int, _Output] = {}  # by descriptor, of this process's own

@@ -3,7 +3,8 @@
 `ppo` is PPO's whole update of one actor-critic, and its passes forward alone; `networks` says where its numbers lie.
 """
 
+from space_dist.kernels.lanes import COMPILES
 from space_dist.kernels.networks import Layout, Shape, aligned
 from space_dist.kernels.ppo import Settings, prepare
 
-__all__ = ["Layout", "Settings", "Shape", "aligned", "prepare"]
+__all__ = ["COMPILES", "Layout", "Settings", "Shape", "aligned", "prepare"]

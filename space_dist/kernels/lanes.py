@@ -20,6 +20,9 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import intrinsic as _intrinsic
 from numba.extending import lower_builtin, models, overload, register_model
 
+COMPILES = not numba.config.DISABLE_JIT
+"""Whether Numba was left to compile when these functions were defined. Else they stay Python's, which runs none."""
+
 F = TypeVar("F", bound=Callable[..., Any])
 BYTES = 64
 # Nothing here allocates, and nothing but what is compiled calls it: reference counts and wrappers cost compile time.

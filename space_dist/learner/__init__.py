@@ -26,10 +26,12 @@ from space_dist.config import (
     ValueDisagreementConfig,
 )
 from space_dist.errors import ConfigError
+from space_dist.kernels import COMPILES
 from space_dist.learner.coupled import CoupledLearner
 from space_dist.learner.elementary import torch_probes  # and replaces kernels of torch
 from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
+from space_dist.learner.networks import is_mlp
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
 from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
@@ -69,10 +71,18 @@ def make_learner(
     return kinds[type(config)](config, observation_space, action_space, seed=seed, total_steps=total_steps)
 
 
-def refuse_device(device: str) -> None:
-    """Raise ConfigError where updates cannot be computed on `device`, here."""
-    if device == "cuda" and not torch.cuda.is_available():
+def refuse_machine(config: RunConfig) -> None:
+    """Raise ConfigError where a config's updates cannot be computed here."""
+    if config.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device: cuda: torch finds no GPU on this machine; use device: cpu")
+    population = config.engine == "population" and config.device == "cpu"
+    if not COMPILES and isinstance(config.learner, PPOConfig) and (population or config.learner.update == "lean"):
+        what = "engine: population" if population else "learner.update: lean"
+        raise ConfigError(
+            "NUMBA_DISABLE_JIT is set (in the environment, or in .numba_config.yaml), which keeps Numba from "
+            f"compiling, and the update of {what} is a compiled function: unset it, or use learner.update: stock with "
+            "engine: single"
+        )
 
 
 def preload() -> None:
@@ -104,12 +114,13 @@ __all__ = [
     "OnPolicyLearner",
     "PopulationLearner",
     "Update",
+    "is_mlp",
     "learn_together",
     "make_ensemble",
     "make_learner",
     "member_bytes",
     "preload",
-    "refuse_device",
+    "refuse_machine",
     "refuse_population",
     "refuse_spaces",
     "stack_key",

@@ -99,7 +99,7 @@ def few_seeds(counts: Mapping[str, int]) -> list[str]:
     return [
         f"Intervals here rest on fewer than {ENOUGH} seeds ({'; '.join(named)}{more}): they are wide, and cover their "
         "95 % only if the seeds are much alike. Where some seeds fail, or all end at the same limit, an interval "
-        f"over three seeds covers 80 to 85 %, one over five 92 %.{without}"
+        f"over three seeds covers 81 to 90 %, one over five 93 to 96 %.{without}"
     ]
 
 

@@ -1,7 +1,8 @@
 """Answers of an MLflow server, bounded: whole within a time, retries included, and of so many bytes once unpacked.
 
-requests' own timeout is that of a single read: a server that sends a byte now and then, or asks for another try in an
-hour, is waited for without end. So each request is made by a thread of its own, which is left behind when it is late.
+requests' own timeout is that of a single read: a server that sends a byte now and then, asks for another try in an
+hour, or sends us on from address to address, is waited for without end. So each request is made by a thread of its own,
+which is left behind when it is late.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from typing import Any, Final
 import requests
 from requests.utils import super_len
 
-SECONDS: Final = 20.0  # for a request and its answer, retries included
+SECONDS: Final = 20.0  # for a request and its answer, retries and redirections included
 _BYTES_A_SECOND: Final = 100_000  # of what is sent, for which there is more time
 MAX_BYTES: Final = 64 << 20  # of an answer; the largest that we ask for are pages of 200 runs
 _CHUNK: Final = 1 << 16
+_UNTIL: Final = "space_dist until"  # a key of a request's hooks, of which requests calls none but its own
 
 
 def bound_answers() -> None:
@@ -33,7 +35,9 @@ def bound_answers() -> None:
 
         def send(self, request: requests.PreparedRequest, stream: bool = False, *rest: Any, **named: Any) -> Any:
             limit = SECONDS + (super_len(request.body) if request.body else 0) / _BYTES_A_SECOND
-            until = time.monotonic() + limit
+            # A redirection is another request, a copy of the one before, with which it has its hooks in common.
+            hooks: Any = request.hooks
+            until: float = hooks.setdefault(_UNTIL, time.monotonic() + limit)
             answers: queue.SimpleQueue[requests.Response | Exception] = queue.SimpleQueue()
 
             def ask() -> None:
@@ -47,7 +51,7 @@ def bound_answers() -> None:
 
             threading.Thread(target=ask, name="mlflow-request", daemon=True).start()
             try:
-                answer = answers.get(timeout=limit)
+                answer = answers.get(timeout=max(0.0, until - time.monotonic()))
             except queue.Empty:
                 raise requests.Timeout(f"no whole answer within {limit:.0f} s", request=request) from None
             if isinstance(answer, Exception):

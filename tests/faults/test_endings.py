@@ -23,15 +23,17 @@ from tests.test_learners import config_for, learner_section, results
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
-def faulty(folder: Path, fault: str) -> configs.RunConfig:
-    """A run whose environment has a fault after 700 steps, once."""
-    env = {"id": "tests.fault_env:make", "kwargs": {"fault": fault, "marker": str(folder / "marker")}}
+def faulty(folder: Path, fault: str, **more: Any) -> configs.RunConfig:
+    """A run whose environment has a fault after 700 steps, once; `more`: or when (`fault_env.make`)."""
+    env = {"id": "tests.fault_env:make", "kwargs": {"fault": fault, "marker": str(folder / "marker"), **more}}
     section = learner_section("ppo", n_steps=32, net_arch=[4])
     return config_for(folder, section, env=env, budget={"steps": 960}, rollout={"shards": 2, "slots": 2})
 
 
-def train(folder: Path, fault: str, *, shell: str = "", **more: Any) -> subprocess.CompletedProcess[str]:
-    (folder / "config.yaml").write_text(configs.dump(faulty(folder, fault)))
+def train(
+    folder: Path, fault: str, *, shell: str = "", where: str = "step", after: int = 0, **more: Any
+) -> subprocess.CompletedProcess[str]:  # fmt: skip
+    (folder / "config.yaml").write_text(configs.dump(faulty(folder, fault, where=where, after=after)))
     command = [sys.executable, "-m", "space_dist.cli", "train", str(folder / "config.yaml"), "--resume",
                "--out", str(folder / "run")]  # fmt: skip
     if shell:
@@ -59,6 +61,29 @@ def test_an_exit_with_0_is_a_failure(
     assert words in str(status.message)
     assert train(tmp_path, fault).returncode == 0  # once is enough
     assert results(tmp_path / "run") == unharmed
+
+
+@pytest.mark.parametrize(
+    ("where", "after", "fault", "words"),
+    [
+        ("constructor", 0, "_exit", "os._exit(0)"),
+        ("constructor", 9, "_exit", "os._exit(0)"),  # of the run itself, which has its folder by then
+        ("reset", 0, "exit", "SystemExit: 0"),
+    ],
+)
+def test_an_exit_with_0_in_a_constructor_or_a_reset_is_a_failure(
+    where: str, after: int, fault: str, words: str, tmp_path: Path
+) -> None:
+    done = train(tmp_path, fault, where=where, after=after)
+    assert (tmp_path / "marker").exists()
+    assert done.returncode not in (0, 75), done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    ledger = Ledger(tmp_path / "run")
+    assert ledger.status_file.exists() == (after > 0)
+    if after:
+        status = ledger.status()
+        assert (status.state, words in str(status.message)) == ("failed", True)
 
 
 def test_an_exit_from_c_leaves_a_run_that_is_seen_to_be_abandoned(unharmed: dict[str, bytes], tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
@@ -17,6 +16,7 @@ import pytest
 
 from space_dist import ray_watch
 from space_dist.errors import SpaceDistError
+from space_dist.ledger import Ledger
 from space_dist.ray_watch import Started, asked, parts, reach
 from tests.patience import PATIENCE
 
@@ -113,7 +113,8 @@ def test_a_ray_that_hangs_or_dies_ends_a_run_with_75(
         assert said in (out / "log.txt").read_text()
         assert said in (tmp_path / "said").read_text()
         assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
-        assert json.loads((out / "status.json").read_text())
+        status = Ledger(out).status()
+        assert (status.state, said in str(status.message)) == ("interrupted", True)
     finally:
         for process in [*below, run]:
             try:
