@@ -98,7 +98,8 @@ def _joined(
             ray.shutdown()  # where Ray is gone, this would end the process at once, before it has said so
             remove_session(context["session_dir"] if address == "local" else None)
 
-    with attended(context, address, gone=False, leave=leave):  # whoever conducts says itself that it is gone
+    # Of a joined Ray that is gone, the conductor tells; from one of our own, Ray itself would end this process first.
+    with attended(context, address, gone=address == "local", leave=leave):
         yield context.get("webui_url") or ""
 
 

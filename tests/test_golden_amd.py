@@ -6,7 +6,7 @@ import pytest
 
 from tests.golden.emulation import GOLDEN, STOPPED, Emulated, emulate, needs_emulator
 
-pytestmark = [pytest.mark.qemu, needs_emulator]
+pytestmark = [pytest.mark.qemu, pytest.mark.timeout(3000), needs_emulator]
 
 
 @pytest.fixture(scope="module")

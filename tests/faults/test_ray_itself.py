@@ -15,6 +15,7 @@ import psutil
 import pytest
 
 from space_dist import ray_watch
+from space_dist.config import to_yaml
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import Ledger
 from space_dist.ray_watch import Started, asked, parts, reach
@@ -115,6 +116,43 @@ def test_a_ray_that_hangs_or_dies_ends_a_run_with_75(
         assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
         status = Ledger(out).status()
         assert (status.state, said in str(status.message)) == ("interrupted", True)
+    finally:
+        for process in [*below, run]:
+            try:
+                process.kill()
+            except (psutil.Error, ProcessLookupError):
+                continue
+        run.wait()
+
+
+@pytest.mark.ray
+def test_a_grid_whose_own_ray_dies_ends_with_75(tmp_path: Path) -> None:
+    grid = tmp_path / "grid.yaml"
+    grid.write_text(to_yaml({
+        "name": "orphan", "extends": str(ROOT / "configs/pointmass_space.yaml"), "seeds": {"count": 1},
+        "set": {
+            "learner.n_steps": 512, "rollout.slots": 1, "evaluation.every_steps": 1_000_000,
+        },
+        "resources": {"workers": 1}, "tracking": {"uri": None},
+    }))  # fmt: skip
+    said, below = "the control store (GCS) of the Ray of our own has died", list[psutil.Process]()
+    with (tmp_path / "said").open("wb") as output:
+        run = subprocess.Popen(
+            [sys.executable, "-c", IMPATIENT, "grid", "run", str(grid), "--root", str(tmp_path)], cwd=ROOT,
+            stdout=output, stderr=output, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not [*tmp_path.glob("orphan/*/s0/metrics.jsonl")] and run.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.2)
+        assert run.poll() is None, (tmp_path / "said").read_text()
+        below = psutil.Process(run.pid).children(recursive=True)
+        for process in below:
+            if process.name() == "gcs_server":
+                process.kill()
+        assert run.wait(PATIENCE) == 75, (tmp_path / "said").read_text()
+        assert said in (tmp_path / "said").read_text()
+        assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
     finally:
         for process in [*below, run]:
             try:
