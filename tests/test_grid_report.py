@@ -244,7 +244,15 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Grid:
     with RunWriter(other) as writer:
         writer.status = other.status()
         writer.set_status(
-            dataclasses.replace(writer.status, fingerprint={"cpu": "another", "torch": "2.0", "code": "new"})
+            dataclasses.replace(
+                writer.status,
+                fingerprint={
+                    "cpu": "another",
+                    "torch": "2.0",
+                    "code": "new",
+                    "scikit-learn": "1.0",
+                },
+            )
         )
     return grid
 
@@ -318,6 +326,7 @@ def test_runs_of_other_code_and_machines_are_named(written: Path) -> None:
     assert (
         "Finished by another cpu, and counted all the same: 1 run, a seed 1 (cpu another; most runs have test)." in text
     )
+    assert "another scikit-learn" not in text  # which the other runs do not use
 
 
 def test_the_heat_map_is_that_of_the_two_parameters(grid: Grid, written: Path) -> None:

@@ -355,7 +355,8 @@ def fingerprint_remarks(cells: Sequence[CellRuns], manifest: Manifest) -> list[s
     for field in sorted({field for _, run in runs for field in run.status.fingerprint}):
         values: dict[str, list[tuple[CellRuns, Run]]] = {}
         for cell, run in runs:
-            values.setdefault(str(run.status.fingerprint.get(field, "unknown")), []).append((cell, run))
+            if field in run.status.fingerprint:  # a library that a cell does not use is not in its runs'
+                values.setdefault(str(run.status.fingerprint[field]), []).append((cell, run))
         usual = manifest.code if field == "code" else max(values, key=lambda value: len(values[value]))
         whose = "the grid was frozen by" if field == "code" else "most runs have"
         lines += [

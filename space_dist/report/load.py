@@ -303,7 +303,10 @@ def _column(rows: Sequence[Row], split: str, measure: str) -> FloatArray:
 def fingerprint_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
     """What of code, machine and libraries differs between runs: field -> its values, sorted."""
     fields = sorted({field for run in runs for field in run.status.fingerprint})
-    values = {field: sorted({str(run.status.fingerprint.get(field, "unknown")) for run in runs}) for field in fields}
+    values = {
+        field: sorted({str(run.status.fingerprint[field]) for run in runs if field in run.status.fingerprint})
+        for field in fields
+    }  # fmt: skip
     return {field: found for field, found in values.items() if len(found) > 1}
 
 
