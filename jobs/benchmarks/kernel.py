@@ -88,7 +88,7 @@ def _products_per_second() -> float:
 
 
 def _compiled(shape: Shape, size: int) -> Callable[[], object]:
-    update, _ = prepare(np.dtype(np.float32))
+    update = prepare(np.dtype(np.float32)).update
     random, layout, n = np.random.default_rng(0), Layout.of(shape, size, 4), size * MINIBATCHES
     m = aligned(layout.size, np.float32)
     for places in layout.places.values():
