@@ -206,17 +206,16 @@ class _Workshop:
             batches[promise.batch].append(promise)
         for batch, promised in batches.items():
             # In the same order every round, whoever was answered first: else episodes would be played again.
-            for number, some in enumerate(_parts(sorted(promised, key=lambda promise: promise.seat or ("", 0)))):
+            for some in _parts(sorted(promised, key=lambda promise: promise.seat or ("", 0))):
                 try:
                     with exits_refused():
-                        self._compute(batch, some, number)
+                        self._compute(batch, some)
                 except Exception:  # somebody's environment may raise anything: whose was it?
                     self._compute_apart(batch, some)
 
-    def _compute(self, batch: Hashable, promised: Sequence[_Promise], number: int = 0) -> None:
-        """number: of the part. An environment may have kept what it drew for the same episodes the last time."""
+    def _compute(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
         setup, works = promised[0].setup, [promise.work for promise in promised]
-        key = (batch, number, sum(promise.slots for promise in promised))
+        key = (batch, sum(promise.slots for promise in promised))
         values: Sequence[Any]
         if rollouts := [work for work in works if isinstance(work, Rollout)]:
             values = collect(self._stage(key, promised), rollouts, length=setup.slot_length)

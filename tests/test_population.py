@@ -13,7 +13,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist import population, rollout
+from space_dist import rollout
 from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
@@ -97,29 +97,6 @@ def test_members_that_stay_together_play_nothing_again(tmp_path: Path, monkeypat
     monkeypatch.setattr(rollout, "_replayed", lambda env, table: played.append(1) or replayed(env, table))
     together(configs, [tmp_path / f"run{number}" for number in range(3)])
     assert len(played) == 1  # the first round's, of nothing
-
-
-def test_the_same_episodes_are_measured_in_an_environment_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    """Which may have kept what it drew for them."""
-    configs = [configured(tmp_path / str(number), number) for number in range(4)]
-    for number in range(4):
-        write_set(tmp_path / str(number) / "train.csv", np.linspace(-1.0, 1.0, 6))
-    met: dict[bytes, list[Any]] = {}
-    plain = population.evaluate
-
-    def evaluate(env: Any, trials: Any) -> Any:
-        met.setdefault(b"".join(trial.seeds.tobytes() for trial in trials), []).append(env)
-        return plain(env, trials)
-
-    monkeypatch.setattr(population, "evaluate", evaluate)
-    monkeypatch.setattr(population, "_SLOTS", 8)
-    monkeypatch.setattr(population, "_KEPT", 100)
-    together(configs, [tmp_path / f"run{number}" for number in range(4)])
-    assert len(met) > 2
-    assert all(len(envs) > 1 and len(set(map(id, envs))) == 1 for envs in met.values())
-    assert len({id(envs[0]) for envs in met.values()}) == len(met)
 
 
 def test_its_learning_is_stable_baselines3s_up_to_rounding(tmp_path: Path) -> None:
