@@ -22,8 +22,14 @@ def fingerprint(arithmetic: str, also: Iterable[str] = ()) -> dict[str, str]:
 
     arithmetic: `arithmetic.digest` of everything.  also: distributions that this run uses besides those of every run.
     """
-    versions = {name: importlib.metadata.version(name) for name in (*_BITS_DEPEND_ON, *also)}
+    versions = {name: _version(name) for name in (*_BITS_DEPEND_ON, *also)}
     return {"arithmetic": arithmetic, "code": code_digest(), **versions}
+
+
+@functools.cache
+def _version(distribution: str) -> str:
+    """Looked for once: the members of a population would look for all of theirs, every one."""
+    return importlib.metadata.version(distribution)
 
 
 @functools.cache

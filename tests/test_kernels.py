@@ -139,7 +139,7 @@ def test_products_have_one_order_whatever_registers_hold(rows: int, panels: int)
 def learnt() -> str:
     """A digest of what a few minibatches leave of small networks: every kind of head and unit, odd sizes."""
     digest, random = hashlib.sha256(), np.random.default_rng(0)
-    update, evaluate = prepare(np.dtype(np.float32))
+    update, evaluate, _ = prepare(np.dtype(np.float32))
     for discrete, activation in ((False, "tanh"), (True, "relu")):
         shape = Shape(7, 3, discrete, (40, 19), activation)
         layout = Layout.of(shape, 50, 4)
@@ -270,7 +270,7 @@ def test_a_lock_that_is_never_given_back_is_waited_for_no_longer_than_patience(
 
 
 def test_only_what_was_prepared_is_compiled() -> None:
-    update, _ = prepare(np.dtype(np.float32))
+    update = prepare(np.dtype(np.float32)).update
     with pytest.raises((TypeError, RuntimeError)):
         update(np.zeros(1, np.float16), *([0] * 7))
     assert {signature[0].dtype for signature in update.signatures} <= {types.float32, types.float64}

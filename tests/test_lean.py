@@ -12,6 +12,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from space_dist import config as configs
@@ -20,6 +21,7 @@ from space_dist.interrupts import StopRequests
 from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
 from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
+from space_dist.learner.lean import LeanBuffer
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
 from space_dist.training import Progress, resolved
 from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
@@ -344,3 +346,21 @@ def test_the_update_is_part_of_what_a_run_is_and_stock_changes_no_identity() -> 
         for overrides in ([], ["learner.update=stock"], ["learner.update=lean"])
     )
     assert plain == stock != ours
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_advantages_are_stable_baselines3s_to_the_bit(kind: type) -> None:
+    random, space = np.random.default_rng(5), spaces.Box(-1.0, 1.0, (2,))
+    stock, ours = (
+        made(40, space, space, n_envs=7, gamma=0.97, gae_lambda=0.93) for made in (RolloutBuffer, LeanBuffer)
+    )
+    rewards, values, ends = random.normal(size=(40, 7)), random.normal(size=(40, 7)), random.random((41, 7)) < 0.2
+    rewards[3, 2], rewards[39, 4] = np.inf, np.nan
+    last_values = torch.as_tensor(random.normal(size=(7, 1)).astype(kind))
+    for buffer in (stock, ours):
+        buffer.rewards[:], buffer.values[:], buffer.episode_starts[:] = rewards, values, ends[:-1]
+        with np.errstate(invalid="ignore"):
+            buffer.compute_returns_and_advantage(last_values, ends[-1])
+    np.testing.assert_array_equal(ours.advantages, stock.advantages)
+    np.testing.assert_array_equal(ours.returns, stock.returns)
+    assert np.isfinite(ours.advantages).any()

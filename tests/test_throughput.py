@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from space_dist.envs import make_batched
+from space_dist.envs.pointmass import START, BatchedPointMass
+from space_dist.errors import SpaceDistError
+from space_dist.instances import POINTMASS_BOUNDS
 from tests.grids import ROOT
 
 sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.batched_vec_env import BatchedVecEnv
 from benchmarks.contenders import TASKS, Contender, specification
-from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio
+from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, process
 
 LINE = "tests.tiny_env:make"
 
 
 def row(*rates: float, **waits: float) -> Row:
-    return Row("somebody", "somehow", lambda: 0.0, waits, list(rates))
+    return Row("somebody", "somehow", lambda: {"rate": 0.0}, waits, 0.002, list(rates))
 
 
 def test_our_batched_environments_step_in_stable_baselines3s_interface_as_by_themselves() -> None:
@@ -61,9 +66,12 @@ def test_ratios_are_medians_of_the_rounds_own() -> None:
 
 def test_the_table_says_who_is_missing_and_where_time_goes() -> None:
     rows = {"subproc2": row(100.0), "lean": row(400.0, simulator=1e-3, arithmetic=5e-4)}
-    text = _markdown({"cartpole": rows}, {"lean_vs_rllib": 4.0}, {}, 1)
-    assert "| somebody | somehow | 400 (400-400) | 4.0 | simulator 40%, dispatch 40%, arithmetic 20% |" in text
-    assert "| RLlib | not installed (extra `bench`) | | | |" in text
+    text = _markdown({"cartpole": rows, "population": rows}, {"lean_vs_rllib": 4.0}, {}, 1, ["rllib", "jax", "sbx"])
+    assert "| somebody | somehow | 400 (400-400) | 4.0 | 80% | simulator 40%, dispatch 40%, arithmetic 20% |" in text
+    cartpole, population = text.split("**PointMass")
+    missing = "| not installed (extra `bench`) | | | | |"
+    assert [f"| {name} {missing}" in cartpole for name in ("RLlib", "JAX", "SBX")] == [True, False, True]
+    assert [f"| {name} {missing}" in population for name in ("RLlib", "JAX", "SBX")] == [False, True, True]
     assert "| `lean_vs_rllib` | 4.00 | 3 |" in text
 
 
@@ -78,3 +86,48 @@ def test_the_tasks_differ_in_nothing_but_what_they_say(name: str) -> None:
 
 def test_every_ratio_has_a_goal() -> None:
     assert PAIRS.keys() == WANTED.keys()
+
+
+def test_what_compiling_takes_is_told_apart() -> None:
+    measured = Row("somebody", "somehow", lambda: {"rate": 10.0, "compile": 7.5}, {})
+    measured.take()
+    assert (measured.rates, measured.chosen) == ([10.0], "somehow; 7.5 s to compile")
+
+
+def test_another_checkout_runs_its_own_code(tmp_path: Path) -> None:
+    package = tmp_path / "old" / "space_dist"
+    shutil.copytree(ROOT / "space_dist", package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "envs" / "pointmass.py").write_text("raise RuntimeError('this is the other one')")
+    asked = specification("pointmass", Contender("ours"), 0.1)
+    with pytest.raises(SpaceDistError, match="this is the other one"):
+        process(asked, Contender("ours").first, str(tmp_path / "old"))
+    nothing = Contender("ours", checkout=str(tmp_path / "nothing"))
+    with pytest.raises(SpaceDistError, match="holds no space_dist"):
+        process(specification("pointmass", nothing, 0.1), nothing.first, nothing.checkout)
+
+
+def test_jaxs_point_masses_go_where_ours_do() -> None:
+    jax = pytest.importorskip("jax")
+    pytest.importorskip("optax")
+    from benchmarks import jitted
+
+    slots, random = 64, np.random.default_rng(3)
+    ours = BatchedPointMass(slots)
+    contexts = random.uniform(POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high, (slots, 3)).astype(np.float32)
+    ours.reset(np.arange(slots), contexts.astype(np.float64), np.arange(slots, dtype=np.uint64))
+    noise = np.stack([np.random.default_rng(seed).standard_normal((100, 10, 2)) for seed in range(slots)])
+    body = np.tile(START, (slots, 1)).astype(np.float32)
+    state, going = jitted.State(body, contexts, np.zeros(slots, np.int32)), np.ones(slots, dtype=bool)
+    crashed, truncated, jitted_step = 0, 0, jax.jit(jitted.step)
+    for time in range(ours.horizon):
+        actions = random.uniform(-12.0, 6.0, (slots, 2)).astype(np.float32)
+        step = ours.step(actions)
+        state, rewards, crashes, ends = jitted_step(state, actions, noise[:, time].astype(np.float32))
+        np.testing.assert_array_equal(np.asarray(crashes)[going], step.terminated[going])
+        np.testing.assert_array_equal(np.asarray(ends)[going], step.truncated[going])
+        np.testing.assert_allclose(np.asarray(rewards)[going], step.rewards[going], atol=1e-3)
+        np.testing.assert_allclose(np.asarray(state.body)[going], step.observations[going], atol=2e-3)
+        crashed, truncated = crashed + int(step.terminated[going].sum()), truncated + int(step.truncated[going].sum())
+        going &= ~(step.terminated | step.truncated)
+    assert crashed
+    assert truncated

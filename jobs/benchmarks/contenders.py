@@ -1,21 +1,23 @@
-"""The contenders of `throughput`, each in a process of its own: `python -m benchmarks.contenders SPECIFICATION`.
+"""The contenders of `throughput`, each in a process of its own.
 
 All of them train PPO with actor and critic of 64-64 tanh units, 10 epochs and the same settings on the same environment
 with its context visible. Times are wall times of whole iterations, collecting and learning, after two to warm up.
+
+What is imported here, rivals import: nothing of ours that takes time at its start, or replaces kernels of torch.
 """
 
 from __future__ import annotations
 
-import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
-
+import importlib
 import itertools
 import json
 import logging
 import math
+import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -27,17 +29,18 @@ from numpy.typing import NDArray
 from space_dist import config as configs
 from space_dist.config import PPOConfig
 from space_dist.envs import BatchedEnv, ContextObservation, make_batched, make_single
-from space_dist.errors import Interrupted
 from space_dist.instances import ContextBounds, read_csv
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
-from space_dist.ledger import Ledger
-from space_dist.place import private_ray
-from space_dist.training import Progress
 
 ROOT = Path(__file__).resolve().parents[2]
 WARM_UP = 2  # iterations
 EPOCHS = 10
+# Libraries read the environment once, when they are loaded or first used: what comes later changes nothing.
+NATIVE = "import numpy, scipy.linalg, torch; torch.ones(64, 64) @ torch.ones(64, 64); torch.ones(64).exp()"
+SINGLE_THREADED = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+XLA_FLAGS = (
+    SINGLE_THREADED, f"{SINGLE_THREADED} --xla_cpu_enable_fast_math=true",
+    f"{SINGLE_THREADED} --xla_cpu_experimental_onednn_custom_call=true",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,9 +87,11 @@ TASKS = {
 class Contender:
     """Who learns, and how it is set up.
 
-    kind: ours, sb3 or rllib.  threads: of torch in the learning process.
-    update, workers, overlap: of ours.  vec_env, n_envs: SB3's dummy or subproc, or batched, ours in its interface.
-    runners, n_envs: RLlib's processes and the environments of each.
+    kind: ours, sb3, sbx, rllib or jax.  threads: of torch in the learning process.
+    update, workers, overlap: of ours; `population` is of so many `members`, as JAX's may be.
+    overrides, checkout: of ours, more settings of the config, and another version.
+    vec_env, n_envs: SB3's and SBX's dummy or subproc, or batched, ours in its interface.
+    runners, n_envs: RLlib's processes and the environments of each.  flags: XLA's.
     """
 
     kind: str
@@ -97,21 +102,46 @@ class Contender:
     vec_env: str = "subproc"
     n_envs: int = 2
     runners: int = 0
+    flags: str = ""
+    members: int = 1
+    overrides: tuple[str, ...] = ()
+    checkout: str = ""
 
     @property
     def title(self) -> str:
         """In tables."""
         if self.kind == "ours":
-            return f"ours, {self.update}" + (", collecting while updating" if self.overlap else "")
-        if self.kind == "rllib":
-            return "RLlib"
+            whose = f"{Path(self.checkout).name}, {self.update}" if self.checkout else f"ours, {self.update}"
+            return whose + (", collecting while updating" if self.overlap else "")
+        if self.kind in ("rllib", "jax"):
+            return {"rllib": "RLlib", "jax": "JAX, everything jitted"}[self.kind]
         names = {"subproc": "SubprocVecEnv", "dummy": "DummyVecEnv", "batched": "our batched environment"}
-        return f"SB3, {names[self.vec_env]}({self.n_envs})"
+        return f"{self.kind.upper()}, {names[self.vec_env]}({self.n_envs})"
+
+    @property
+    def first(self) -> str:
+        """What its process does before it imports anything else.
+
+        Ours settles its arithmetic and its threads before NumPy is loaded. Rivals get what the libraries choose by
+        themselves, which they do once.
+        """
+        native = "import numpy" if self.kind == "jax" else NATIVE
+        return "import space_dist.cli" if self.kind == "ours" else native
+
+    @property
+    def pinned(self) -> bool:
+        """Whether a process of it keeps to one core."""
+        return self.kind == "jax" or self.update == "population"
 
     @property
     def setting(self) -> str:
         """What was chosen for it."""
         threads = f"{self.threads} torch thread{'s' if self.threads > 1 else ''}"
+        if self.kind == "jax" or self.update == "population":
+            members = f"{self.members} member{'s' if self.members > 1 else ''} on a core"
+            return f"{members}, XLA_FLAGS={self.flags!r}" if self.kind == "jax" else members
+        if self.kind == "sbx":
+            return f"XLA_FLAGS={self.flags!r}"
         if self.kind == "ours":
             return f"{self.workers} Ray actors" if self.workers else "one process"
         if self.kind == "rllib":
@@ -122,13 +152,13 @@ class Contender:
 class _Stopwatch:
     """Marks the ends of iterations, until there are enough."""
 
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
+    def __init__(self, seconds: float, clock: Callable[[], float]) -> None:
+        self._seconds, self._clock = seconds, clock
         self._marks: list[tuple[int, float]] = []
 
     def mark(self, steps: int) -> bool:
         """At so many steps of the run. Whether that is enough: an iteration at least, and the time asked for."""
-        self._marks.append((steps, time.perf_counter()))
+        self._marks.append((steps, self._clock()))
         return len(self._marks) > WARM_UP + 1 and self._marks[-1][1] - self._marks[WARM_UP][1] >= self._seconds
 
     def rate(self) -> float:
@@ -137,26 +167,34 @@ class _Stopwatch:
         return (last - first) / (end - start)
 
 
-def measure(task: Task, contender: Contender, seconds: float) -> float:
-    """Environment steps per second of `contender` on `task`, over about `seconds`."""
-    import torch
+def measure(task: Task, contender: Contender, seconds: float, clock: Callable[[], float]) -> dict[str, float]:
+    """`rate`: environment steps per second of `contender` on `task`, over about `seconds` of the clock.
 
-    watch = _Stopwatch(seconds)
+    compile: seconds before the first iteration that went into compiling, of those who do it apart.
+    """
+    watch = _Stopwatch(seconds, clock)
+    if contender.kind == "jax":
+        compiling = _jax(task, contender, watch.mark)
+        return {"rate": watch.rate(), "compile": compiling}
     if contender.kind == "rllib":
         _rllib(task, contender, watch)
-        return watch.rate()
-    if contender.kind == "ours":
-        _ours(task, contender, watch)
-        return watch.rate()
-    torch.set_num_threads(contender.threads)
-    _sb3(task, contender, watch)
-    return watch.rate()
+    elif contender.kind == "ours":
+        (_population if contender.update == "population" else _ours)(task, contender, watch)
+    else:
+        _sb3(task, contender, watch)
+    return {"rate": watch.rate()}
 
 
 def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    from space_dist.errors import Interrupted
+    from space_dist.interrupts import StopRequests
+    from space_dist.launch import launch
+    from space_dist.ledger import Ledger
+    from space_dist.training import Progress
+
     config = task.run_config(
         f"learner.update={contender.update}", f"resources.workers={contender.workers}",
-        f"rollout.overlap={str(contender.overlap).lower()}",
+        f"rollout.overlap={str(contender.overlap).lower()}", *contender.overrides,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         run, seen = Path(folder) / "run", [-1]
@@ -174,6 +212,42 @@ def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
         raise RuntimeError("the run ended before it was measured")
 
 
+class _Measured(Exception):  # noqa: N818 - no error
+    """That is enough."""
+
+
+def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    """Runs side by side in this process, marked where the last of them has collected."""
+    from space_dist.interrupts import StopRequests
+    from space_dist.learner import preload
+    from space_dist.population import advance, member
+    from space_dist.training import Learn
+
+    def watched(work: Any) -> Iterator[Any]:
+        answer: Any = None
+        while True:
+            request = work.send(answer)
+            if isinstance(request, Learn) and watch.mark(request.steps * contender.members):
+                raise _Measured
+            answer = yield request
+
+    def ended(path: Path, outcome: object) -> None:
+        raise RuntimeError(f"{path} ended before it was measured: {outcome}")
+
+    preload()
+    with tempfile.TemporaryDirectory() as folder:
+        stop, works = StopRequests(), dict[Path, Any]()
+        for seed in range(contender.members):
+            path = Path(folder) / str(seed)
+            config = task.run_config("engine=population", f"seed={seed}", *contender.overrides)
+            works[path] = member(config, path, stop=stop)
+        works[path] = watched(works[path])
+        try:
+            advance(works, ended)
+        except _Measured:
+            return
+
+
 def _single(config: configs.RunConfig) -> Callable[[], gym.Env[Any, Any]]:
     """The registered Gymnasium environment, which draws a context at each reset, with that context in its observations.
 
@@ -182,8 +256,36 @@ def _single(config: configs.RunConfig) -> Callable[[], gym.Env[Any, Any]]:
     return lambda: ContextObservation(make_single(config.env.id, **config.env.kwargs))
 
 
+def _jax(task: Task, contender: Contender, mark: Callable[[int], bool]) -> float:
+    """Train until `mark`, which is told of environment steps, has enough; returns seconds of compiling."""
+    _start_xla(contender)
+    from benchmarks import jitted
+
+    config, settings = _settings(task)
+    start = time.perf_counter()
+    bounds = make_batched(config.env.id, 1, context_visible=False, kwargs=config.env.kwargs).context_bounds
+    iterate, learning = jitted.prepare(
+        settings, _contexts(config, bounds), members=contender.members, n_envs=task.slots
+    )
+    compiling = time.perf_counter() - start
+    steps, enough = 0, mark(0)
+    while not enough:
+        learning, rewards = iterate(learning)
+        rewards.block_until_ready()
+        steps += task.n_steps * contender.members
+        enough = mark(steps)
+    if not np.isfinite(np.asarray(rewards)).all():
+        raise RuntimeError("the networks are no longer numbers")
+    return compiling
+
+
+def _start_xla(contender: Contender) -> None:
+    os.environ |= {"XLA_FLAGS": contender.flags, "JAX_PLATFORMS": "cpu"}
+
+
 def _sb3(task: Task, contender: Contender, watch: _Stopwatch) -> None:
-    from stable_baselines3 import PPO
+    """SB3's PPO, or SBX's."""
+    import torch
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -206,7 +308,11 @@ def _sb3(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     else:
         env = (SubprocVecEnv if contender.vec_env == "subproc" else DummyVecEnv)([_single(config)] * n_envs)
         env.seed(0)
-    PPO(
+    torch.set_num_threads(contender.threads)
+    if contender.kind == "sbx":
+        _start_xla(contender)
+    algorithm: Any = importlib.import_module({"sb3": "stable_baselines3", "sbx": "sbx"}[contender.kind]).PPO
+    algorithm(
         "MlpPolicy", env, n_steps=task.n_steps // n_envs, batch_size=task.batch_size, n_epochs=EPOCHS, device="cpu",
         gamma=settings.gamma, gae_lambda=settings.gae_lambda, learning_rate=settings.learning_rate,
         ent_coef=settings.ent_coef, vf_coef=settings.vf_coef, clip_range=settings.clip_range, seed=0,
@@ -231,6 +337,8 @@ def _contexts(config: configs.RunConfig, bounds: ContextBounds) -> NDArray[np.fl
 
 
 def _rllib(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    from space_dist.place import private_ray
+
     private_ray()
     import ray
     from ray.rllib.algorithms import ppo
@@ -276,8 +384,12 @@ def limits(task: Task) -> dict[str, float]:
 
     single, batched: seconds per environment step, alone and among ours.  arithmetic: seconds per environment step for
     the networks' multiplications, when acting and in all epochs, at the rate of a large matrix product.
+    kernel: seconds per environment step for our compiled update, alone.
     """
     import torch
+
+    from benchmarks import kernel
+    from space_dist.kernels import Shape
 
     torch.set_num_threads(1)
     config, settings = _settings(task)
@@ -296,7 +408,9 @@ def limits(task: Task) -> dict[str, float]:
         matrix @ matrix
         count += 1
     per_product = (time.perf_counter() - start) / (count * 512**3)
-    return found | {"arithmetic": (products + learning) * per_product}
+    shape = Shape(inputs, outputs, isinstance(space, gym.spaces.Discrete), settings.net_arch, settings.activation)
+    update = EPOCHS / task.batch_size * kernel.seconds(shape, task.batch_size)
+    return found | {"arithmetic": (products + learning) * per_product, "kernel": update}
 
 
 def _single_seconds(env: gym.Env[Any, Any], steps: int = 2_000) -> float:
@@ -325,20 +439,39 @@ def _batched_seconds(env: BatchedEnv, config: configs.RunConfig, steps: int = 1_
     return (time.perf_counter() - start) / (steps * env.n_slots)
 
 
-def specification(task: str, contender: Contender | None, seconds: float) -> str:
-    """What a process of this module is given; without a contender it measures the limits."""
-    return json.dumps({"task": task, "contender": contender and asdict(contender), "seconds": seconds})
+def specification(
+    task: str, contender: Contender | None, seconds: float,
+    *, core: int | None = None, updates: int | None = None, cpu: bool = False,
+) -> str:  # fmt: skip
+    """What a process of this module is given; without a contender it measures the limits.
+
+    core: the one that it keeps to, of those it may use.  updates: train for so many, and measure nothing (JAX).
+    cpu: whether the seconds are the process's CPU time.
+    """
+    asked = {"task": task, "contender": contender and asdict(contender), "seconds": seconds}
+    return json.dumps({**asked, "core": core, "updates": updates, "cpu": cpu})
 
 
-def _main() -> None:
-    given = json.loads(sys.argv[1])
+def main() -> None:
+    """Do what the command line's specification says, and print the numbers."""
+    given = json.loads(sys.argv[-1])
     task = TASKS[given["task"]]
+    if given["core"] is not None:
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[given["core"] % len(cores)]})
     if given["contender"] is None:
         found = limits(task)
     else:
-        found = {"rate": measure(task, Contender(**given["contender"]), given["seconds"])}
+        contender = Contender(**given["contender"] | {"overrides": tuple(given["contender"]["overrides"])})
+        if contender.checkout and not Path(configs.__file__).is_relative_to(contender.checkout):
+            raise RuntimeError(f"{contender.checkout} holds no space_dist: {configs.__file__} was imported")
+        if given["updates"] is not None:
+            enough = given["updates"] * task.n_steps * contender.members
+            found = {"compile": _jax(task, contender, lambda steps: steps >= enough)}
+        else:
+            found = measure(task, contender, given["seconds"], time.process_time if given["cpu"] else time.perf_counter)
     print(json.dumps(found))
 
 
 if __name__ == "__main__":
-    _main()
+    main()

@@ -60,6 +60,16 @@ def kernel(
         )
 
 
+def seconds(shape: Shape, size: int, rounds: int = 40) -> float:
+    """That a minibatch of `size` takes the compiled update, at the least."""
+    work, best = _compiled(shape, size), math.inf
+    for _ in range(rounds):
+        start = time.perf_counter()
+        work()
+        best = min(best, time.perf_counter() - start)
+    return best / MINIBATCHES
+
+
 def _products_per_second() -> float:
     """Additions and multiplications of the kernel's own innermost loop, on numbers that stay in the first cache."""
 
@@ -78,7 +88,7 @@ def _products_per_second() -> float:
 
 
 def _compiled(shape: Shape, size: int) -> Callable[[], object]:
-    update, _ = prepare(np.dtype(np.float32))
+    update = prepare(np.dtype(np.float32)).update
     random, layout, n = np.random.default_rng(0), Layout.of(shape, size, 4), size * MINIBATCHES
     m = aligned(layout.size, np.float32)
     for places in layout.places.values():

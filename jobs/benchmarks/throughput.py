@@ -1,7 +1,8 @@
-"""How fast PPO trains: ours beside Stable-Baselines3 and RLlib, interleaved, each rival with its best setting."""
+"""How fast PPO trains: ours beside JAX, SBX, SB3 and RLlib, interleaved, each rival with its best setting."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -18,10 +19,10 @@ from typing import Annotated, Any, Optional
 import typer
 from rich.console import Console
 
-from benchmarks.contenders import TASKS, Contender, specification
+from benchmarks.contenders import TASKS, XLA_FLAGS, Contender, specification
 from space_dist import config as configs
+from space_dist.arithmetic import SETTINGS
 from space_dist.errors import SpaceDistError
-from space_dist.ledger import Ledger
 
 ROOT = Path(__file__).resolve().parents[2]
 CORES = 2
@@ -34,10 +35,13 @@ TABLE1: dict[str, list[Any]] = {  # docs/grids.md
     "curriculum.kappa": [1, 4, 16, 64], "curriculum.eta": [0.025, 0.05, 0.1, 0.2],
 }  # fmt: skip
 TABLE1_STEPS = 4 * 4 * 10 * 1e6
+JITTED = ("pointmass", "pointmass_large")  # whose environment is there for JAX
+EXTRA = {"rllib": "RLlib", "jax": "JAX", "sbx": "SBX"}  # of the extra `bench`: rows that may be missing
 # What is wanted at least, on two cores.
 WANTED = {
     "lean_vs_subproc2": 3.0, "lean_vs_best_sb3": 1.5, "lean_vs_rllib": 3.0, "batched_vs_subproc2": 12.0,
-    "batched_vs_sb3_batched": 1.4, "ant_vs_subproc2": 1.7, "population_vs_best_sb3": 10.0,
+    "batched_vs_sb3_batched": 1.4, "ant_vs_subproc2": 1.7, "population_vs_best_sb3": 20.0, "lean_vs_jax": 0.9,
+    "learning_vs_jax": 1.1, "lean_vs_before": 4.0, "population_vs_before": 2.5,
 }  # fmt: skip
 PAIRS = {  # a ratio: the task, ours, and the rival
     "lean_vs_subproc2": ("pointmass", "lean", "subproc2"),
@@ -47,6 +51,10 @@ PAIRS = {  # a ratio: the task, ours, and the rival
     "batched_vs_sb3_batched": ("pointmass_large", "lean", "sb3_batched"),
     "ant_vs_subproc2": ("ant", "overlap", "subproc2"),
     "population_vs_best_sb3": ("population", "population", "best_sb3"),
+    "lean_vs_jax": ("pointmass", "lean", "jax"),
+    "learning_vs_jax": ("population", "learning", "jax"),
+    "lean_vs_before": ("pointmass", "lean", "before"),
+    "population_vs_before": ("population", "population", "before"),
 }
 console = Console()
 
@@ -55,23 +63,42 @@ console = Console()
 class Row:
     """One line of the table.
 
-    measure: gives environment steps per second.  waits: seconds per environment step that no dispatch can save, by
-    cause.  rates: one per round.
+    measure: gives `rate`, environment steps per second, and of some `compile`, seconds.  waits: seconds per environment
+    step that no dispatch can save, by cause.  kernel: seconds per environment step of our compiled update, alone, on
+    all the cores that the row has.  rates, compiling: one per round.
     """
 
     title: str
     setting: str
-    measure: Callable[[], float]
+    measure: Callable[[], Mapping[str, float]]
     waits: dict[str, float]
+    kernel: float = 0.0
     rates: list[float] = field(default_factory=list)
+    compiling: list[float] = field(default_factory=list)
+
+    def take(self) -> None:
+        """Measure once more."""
+        found = self.measure()
+        self.rates.append(found["rate"])
+        if "compile" in found:
+            self.compiling.append(found["compile"])
 
     @property
     def rate(self) -> float:
         """Median over the rounds."""
         return statistics.median(self.rates)
 
+    @property
+    def chosen(self) -> str:
+        """The setting, and what compiling took, which no rate but those of whole wall times has in it."""
+        if not self.compiling:
+            return self.setting
+        return f"{self.setting}; {statistics.median(self.compiling):.1f} s to compile"
+
     def limit(self) -> str:
         """Where its time goes, as far as can be told: what is left is dispatch."""
+        if not self.waits:
+            return ""
         shares = {cause: min(1.0, seconds * self.rate) for cause, seconds in self.waits.items()}
         shares["dispatch"] = max(0.0, 1.0 - sum(shares.values()))
         ordered = sorted(shares.items(), key=lambda item: -item[1])
@@ -83,21 +110,28 @@ def throughput(
     seconds: Annotated[float, typer.Option(min=0.1, help="Length of one measurement, start and warm-up apart.")] = 5.0,
     only: Annotated[Optional[list[str]], typer.Option(help=f"Only these parts: {', '.join(PARTS)}.")] = None,  # noqa: UP045
     member_steps: Annotated[int, typer.Option(min=2048, help="Steps of each of the 32 runs of a grid.")] = 102_400,
+    before: Annotated[Optional[Path], typer.Option(help="Also measure the checkout there, in this Python.")] = None,  # noqa: UP045
     out: Annotated[Optional[Path], typer.Option(help="Folder for the table and the figure.")] = None,  # noqa: UP045
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
 ) -> None:
-    """Environment steps per second of PPO: ours (stock, lean, population) beside SB3 and RLlib."""
+    """Environment steps per second of PPO: ours (stock, lean, population) beside JAX, SBX, SB3 and RLlib."""
     unknown = sorted({*(only or ())} - {*PARTS})
     if unknown:
         raise typer.BadParameter(f"{unknown[0]} is no part; allowed: {', '.join(PARTS)}", param_hint="--only")
+    if before is not None and not (before / "space_dist" / "__init__.py").exists():
+        raise typer.BadParameter(f"{before} is no checkout of space_dist", param_hint="--before")
+    checkout = "" if before is None else str(before.resolve())
     parts = only or PARTS
-    table: dict[str, dict[str, Row]] = {name: _rows(name, seconds) for name in TASKS if name in parts}
+    missing = _missing()
+    table: dict[str, dict[str, Row]] = {
+        name: _rows(name, seconds, missing, checkout) for name in TASKS if name in parts
+    }
     if "population" in parts:
-        table["population"] = _population_rows(seconds, member_steps)
+        table["population"] = _population_rows(seconds, member_steps, missing, checkout)
     for number in range(rounds):
         for name, rows in table.items():
             for row in rows.values():
-                row.rates.append(row.measure())
+                row.take()
                 console.print(
                     f"round {number + 1}, {name}: {row.title}: {row.rates[-1]:,.0f} steps/s",
                     markup=False,
@@ -109,7 +143,7 @@ def throughput(
         if task in table and rival in table[task]
     }
     projected = _table1(member_steps) if "table1" in parts else {}
-    text = _markdown(table, ratios, projected, rounds)
+    text = _markdown(table, ratios, projected, rounds, missing)
     console.print(text, markup=False, soft_wrap=True)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -132,9 +166,9 @@ def _ratio(ours: Row, rival: Row) -> float:
 # ---- who is measured ----
 
 
-def _rows(task: str, seconds: float) -> dict[str, Row]:
+def _rows(task: str, seconds: float, missing: Collection[str], checkout: str) -> dict[str, Row]:
     """Everybody on one task, rivals with the settings that were fastest in a search."""
-    costs = _process(specification(task, None, 0.0))
+    costs = process(specification(task, None, 0.0), Contender("ours").first)
     subproc = [Contender("sb3", vec_env="subproc", n_envs=2, threads=threads) for threads in (1, CORES)]
     stock = [
         Contender("sb3", vec_env=kind, n_envs=n)
@@ -145,24 +179,43 @@ def _rows(task: str, seconds: float) -> dict[str, Row]:
     found["sb3_batched"] = _best(task, [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED], seconds)
     for name in ("best_sb3", "sb3_batched"):
         found[name] = _best(task, [found[name], replace(found[name], threads=CORES)], seconds)
-    if _rllib_installed():
+    if "rllib" not in missing:
         found["rllib"] = _best(task, [Contender("rllib", runners=r, n_envs=n) for r, n in RUNNERS], seconds)
+    if "sbx" not in missing:
+        found["sbx"] = _best_sbx(task, seconds)
+    if task in JITTED and "jax" not in missing:
+        found["jax"] = _best_jax(task, seconds, members=1)
     workers = CORES if TASKS[task].shards > 1 else 0
     found |= {update: Contender("ours", update=update, workers=workers) for update in ("stock", "lean")}
     if workers:
         found["overlap"] = replace(found["lean"], overlap=True)
+    if checkout:
+        found["before"] = replace(found["lean"], checkout=checkout)
     return {
         name: Row(
-            contender.title, contender.setting, lambda contender=contender: _rate(task, contender, seconds),  # type: ignore[misc]
-            _waits(contender, costs),
+            contender.title, contender.setting,
+            lambda contender=contender: _measured(task, contender, seconds),  # type: ignore[misc]
+            _waits(contender, costs), costs["kernel"],
         )
         for name, contender in found.items()
     }  # fmt: skip
 
 
+def _best_sbx(task: str, seconds: float) -> Contender:
+    contenders = [Contender("sbx", vec_env="batched", n_envs=n, flags=XLA_FLAGS[0]) for n in BATCHED]
+    best = _best(task, contenders, seconds)
+    return _best(task, [replace(best, flags=flags) for flags in ("", *XLA_FLAGS)], seconds)
+
+
+def _best_jax(task: str, seconds: float, *, members: int) -> Contender:
+    return _best(task, [Contender("jax", members=members, flags=flags) for flags in XLA_FLAGS], seconds)
+
+
 def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
     """The fastest in one short measurement each; one that does not get it done in a minute is none."""
-    rates = {contender: _rate(task, contender, seconds / 2.0, patience=PATIENCE) for contender in contenders}
+    rates = {
+        contender: _measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders
+    }
     for contender, rate in rates.items():
         console.print(
             f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s",
@@ -174,7 +227,12 @@ def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contend
 
 
 def _waits(contender: Contender, costs: dict[str, float]) -> dict[str, float]:
-    """Seconds per environment step of the simulator and of arithmetic, as far as they cannot run side by side."""
+    """Seconds per environment step of the simulator and of arithmetic, as far as they cannot run side by side.
+
+    Nothing of JAX, whose simulator is its own.
+    """
+    if contender.kind == "jax":
+        return {}
     batched = contender.kind == "ours" or contender.vec_env == "batched"
     processes = {"ours": contender.workers, "rllib": contender.runners}.get(
         contender.kind, contender.n_envs if contender.vec_env == "subproc" else 1
@@ -183,43 +241,88 @@ def _waits(contender: Contender, costs: dict[str, float]) -> dict[str, float]:
     return {"simulator": simulator, "arithmetic": costs["arithmetic"] / contender.threads}
 
 
-def _population_rows(seconds: float, member_steps: int) -> dict[str, Row]:
-    """A grid of 32 runs by populations, beside SB3 with two processes at a time."""
-    costs = _process(specification("pointmass", None, 0.0))
+def _population_rows(
+    seconds: float, member_steps: int, missing: Collection[str], checkout: str
+) -> dict[str, Row]:  # fmt: skip
+    """Grids of 32 runs on all cores: by whole wall time, or by that of collecting and learning alone."""
+    costs = process(specification("pointmass", None, 0.0), Contender("ours").first)
     rivals = {
         "best_sb3": [Contender("sb3", vec_env="dummy", n_envs=n) for n in DUMMY],
         "sb3_batched": [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED],
     }
+    learning = "collecting and learning alone"
+    whole, kernel = "whole wall time: start, evaluation, ledgers and checkpoints included", costs["kernel"] / CORES
     halves = {"simulator": costs["batched"] / CORES, "arithmetic": costs["arithmetic"] / CORES}
-    rows = {}
-    for name, contenders in rivals.items():
-        best = _best("pointmass", contenders, seconds)
+    rows, engine = {}, {"engine": "population"}
+
+    def alone(name: str, contender: Contender) -> None:
+        """By time of learning, in as many processes as there are cores."""
         rows[name] = Row(
-            f"{best.title}, {CORES} processes at a time", best.setting,
-            lambda best=best: _rate("pointmass", best, seconds, processes=CORES),  # type: ignore[misc]
-            {cause: wait / CORES for cause, wait in _waits(best, costs).items()},
+            f"{contender.title}, {CORES} processes at a time", f"{learning}; {contender.setting}",
+            lambda: _measured("pointmass", contender, seconds, processes=CORES),
+            {cause: wait / CORES for cause, wait in _waits(contender, costs).items()}, kernel,
         )  # fmt: skip
-    steps, engine = 32 * _whole_updates(member_steps), {"engine": "population"}
-    rows["population"] = Row(
-        "ours, population: a grid of 32 runs", "whole wall time: start, evaluation, ledgers and checkpoints included",
-        lambda: steps / _grid_seconds(member_steps, MEMBERS, 8, engine), halves,
-    )  # fmt: skip
+
+    for name, contenders in rivals.items():
+        alone(name, _best("pointmass", contenders, seconds))
+    steps, each = 32 * _whole_updates(member_steps), 32 // CORES
+    if "sbx" not in missing:
+        alone("sbx", _best_sbx("pointmass", seconds))
+    if "jax" not in missing:
+        jax = _best_jax("pointmass", seconds, members=each)
+        alone("jax", jax)
+        rows["jax_whole"] = Row(
+            f"{jax.title}: 32 runs", "whole wall time: start and compiling included; neither evaluation nor ledger",
+            lambda: {"rate": steps / _jax_seconds(jax, member_steps)}, {}, kernel,
+        )  # fmt: skip
+    ours = [("learning", "population", "")] + ([("before_learning", "before", checkout)] if checkout else [])
+    for name, of_grid, where in ours:
+        contender = Contender("ours", update="population", members=each, checkout=where)
+        alone(name, contender)
+        rows[of_grid] = Row(
+            f"{contender.title}: a grid of 32 runs", whole,
+            lambda where=where: {"rate": steps / _grid_seconds(member_steps, MEMBERS, 8, engine, where)},  # type: ignore[misc]
+            halves, kernel,
+        )  # fmt: skip
     return rows
 
 
 # ---- how it is measured ----
 
 
-def _rate(
+def _measured(
     task: str, contender: Contender, seconds: float, *, processes: int = 1, patience: float | None = None
-) -> float:
-    """Steps per second of so many processes at once, together; 0 if they take longer than `patience` seconds."""
-    wanted = specification(task, contender, seconds)
-    running = [_start(wanted) for _ in range(processes)]
+) -> dict[str, float]:
+    """`rate`: steps per second of so many processes at once, together; 0 if they take longer than `patience` seconds.
+
+    `compile`: seconds, of those who compile apart.
+    """
+    found = _together([
+        (specification(task, contender, seconds, core=core if contender.pinned else None), contender)
+        for core in range(processes)
+    ], patience)  # fmt: skip
+    if not found:
+        return {"rate": 0.0}
+    compiling = {"compile": max(one["compile"] for one in found)} if "compile" in found[0] else {}
+    return {"rate": sum(one["rate"] for one in found), **compiling}
+
+
+def _jax_seconds(contender: Contender, member_steps: int) -> float:
+    """Wall time of as many pinned processes as there are cores, from their start to their end."""
+    updates = _whole_updates(member_steps) // 2048
+    start = time.perf_counter()
+    _together([(specification("pointmass", contender, 0.0, core=core, updates=updates), contender)
+               for core in range(CORES)])  # fmt: skip
+    return time.perf_counter() - start
+
+
+def _together(wanted: Sequence[tuple[str, Contender]], patience: float | None = None) -> list[dict[str, float]]:
+    """What so many processes at once have found; nothing if they take longer than `patience` seconds."""
+    running = [_start(asked, contender.first, contender.checkout) for asked, contender in wanted]
     try:
-        return sum(_finish(process, wanted, patience)["rate"] for process in running)
+        return [_finish(process, one, patience) for process, (one, _) in zip(running, wanted, strict=True)]
     except subprocess.TimeoutExpired:
-        return 0.0
+        return []
     finally:
         for process in running:
             if process.poll() is None:
@@ -227,18 +330,26 @@ def _rate(
                 process.wait()
 
 
-def _process(wanted: str) -> dict[str, float]:
-    return _finish(_start(wanted), wanted)
+def process(wanted: str, first: str, checkout: str = "") -> dict[str, float]:
+    """What one process of `contenders` finds, which does something else `first`; of another version, if wanted."""
+    return _finish(_start(wanted, first, checkout), wanted)
 
 
-def _start(wanted: str) -> subprocess.Popen[str]:
+def _start(wanted: str, first: str, checkout: str = "") -> subprocess.Popen[str]:
     # OpenMP's threads are what torch's contenders set themselves; everything else keeps to one.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "jobs")])}
+    environment = _environment(checkout)
     environment |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+    code = f"{first}; from benchmarks.contenders import main; main()"
     return subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-m", "benchmarks.contenders", wanted],
+        [sys.executable, "-P", "-W", "ignore", "-c", code, wanted],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True,
     )  # fmt: skip
+
+
+def _environment(checkout: str) -> dict[str, str]:
+    """That of a process with this `space_dist` or another, without what ours has told libraries."""
+    found = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    return found | {"PYTHONPATH": os.pathsep.join([checkout or str(ROOT), str(ROOT / "jobs")])}
 
 
 def _finish(process: subprocess.Popen[str], wanted: str, patience: float | None = None) -> dict[str, float]:
@@ -249,18 +360,25 @@ def _finish(process: subprocess.Popen[str], wanted: str, patience: float | None 
     return found
 
 
-def _rllib_installed() -> bool:
-    """Whether RLlib can be imported: Ray ships it, without what it needs (the extra `bench`)."""
+def _missing() -> list[str]:
+    """Who of the extra `bench` cannot be imported. Ray ships RLlib without what it needs."""
     tried = subprocess.run([sys.executable, "-c", "import ray.rllib.algorithms.ppo"], capture_output=True, check=False)
-    return tried.returncode == 0
+    found = {"rllib": tried.returncode == 0}
+    found |= {"jax": all(map(importlib.util.find_spec, ("jax", "optax"))), "sbx": bool(importlib.util.find_spec("sbx"))}
+    return [name for name in EXTRA if not found[name]]
 
 
 def _whole_updates(steps: int) -> int:
     return steps // 2048 * 2048
 
 
-def _grid_seconds(member_steps: int, axes: Mapping[str, list[Any]], seeds: int, more: dict[str, Any]) -> float:
-    """Wall time of `space-dist grid run`, all 32 runs of which must have come to their end."""
+def _grid_seconds(
+    member_steps: int, axes: Mapping[str, list[Any]], seeds: int, more: dict[str, Any], checkout: str = ""
+) -> float:
+    """Wall time of `space-dist grid run`, all 32 runs of which must have come to their end.
+
+    checkout: of another version, in whose code they then are.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = folder / "grid.yaml"
@@ -269,14 +387,17 @@ def _grid_seconds(member_steps: int, axes: Mapping[str, list[Any]], seeds: int, 
             "set": {"budget.steps": member_steps, **more},
             "grid": dict(axes), "seeds": {"count": seeds}, "tracking": {"uri": None},
         }))  # fmt: skip
-        command = [sys.executable, "-m", "space_dist.cli", "grid", "run", str(path), "--root", str(folder / "runs")]
+        command = [sys.executable, "-P", "-m", "space_dist.cli"]
+        command += ["grid", "run", str(path), "--root", str(folder / "runs")]
         start = time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, cwd=folder, env=_environment(checkout)
+        )  # fmt: skip
         seconds = time.perf_counter() - start
         if done.returncode:
             raise SpaceDistError(f"the grid did not complete: {done.stdout[-2000:]}{done.stderr[-2000:]}")
-        statuses = [Ledger(file.parent).status() for file in (folder / "runs").rglob("status.json")]
-        steps = [status.steps for status in statuses if status.state == "done"]
+        statuses = [json.loads(file.read_bytes()) for file in (folder / "runs").rglob("status.json")]
+        steps = [status["steps"] for status in statuses if status["state"] == "done"]
         if sorted(steps) != [_whole_updates(member_steps)] * 32:
             raise SpaceDistError(f"not all 32 runs came to their end: {sorted(steps)}")
     return seconds
@@ -302,23 +423,28 @@ def _title(part: str) -> str:
 
 
 def _markdown(
-    table: dict[str, dict[str, Row]], ratios: dict[str, float], projected: dict[str, float], rounds: int
-) -> str:
+    table: dict[str, dict[str, Row]], ratios: dict[str, float], projected: dict[str, float], rounds: int,
+    missing: Collection[str],
+) -> str:  # fmt: skip
     lines = [
         f"Environment steps per second: medians of {rounds} interleaved rounds (least and most), and ratios to the "
         "first line. Where the time goes: the environment's own steps and the networks' multiplications, as measured "
-        "alone; all else is dispatch (Python, autograd, interprocess communication).",
+        "alone; all else is dispatch (Python, autograd, interprocess communication). Of the kernel: "
+        "to what our compiled update alone would do here, without collecting.",
         "",
     ]
     for part, rows in table.items():
         first = next(iter(rows.values()))
-        lines += [f"**{_title(part)}**", "", "| | setting | steps/s | ratio | where the time goes |",
-                  "|---|---|---:|---:|---|"]  # fmt: skip
+        lines += [f"**{_title(part)}**", "", "| | setting | steps/s | ratio | of the kernel | where the time goes |",
+                  "|---|---|---:|---:|---:|---|"]  # fmt: skip
         for row in rows.values():
             span = f"{row.rate:,.0f} ({min(row.rates):,.0f}-{max(row.rates):,.0f})"
-            lines.append(f"| {row.title} | {row.setting} | {span} | {_ratio(row, first):.1f} | {row.limit()} |")
-        if part in TASKS and "rllib" not in rows:
-            lines.append("| RLlib | not installed (extra `bench`) | | | |")
+            lines.append(
+                f"| {row.title} | {row.chosen} | {span} | {_ratio(row, first):.1f} | {row.rate * row.kernel:.0%} "
+                f"| {row.limit()} |"
+            )
+        there = {"rllib": part in TASKS, "jax": part in JITTED or part not in TASKS, "sbx": True}
+        lines += [f"| {EXTRA[name]} | not installed (extra `bench`) | | | | |" for name in missing if there[name]]
         lines.append("")
     if ratios:
         lines += ["| ratio | measured | wanted at least |", "|---|---:|---:|"]
@@ -362,7 +488,8 @@ def _numbers(table: dict[str, dict[str, Row]], ratios: dict[str, float], project
         "table1_hours": projected,
         "rates": {part: {name: row.rates for name, row in rows.items()} for part, rows in table.items()},
         "settings": {
-            part: {name: f"{row.title}; {row.setting}" for name, row in rows.items()} for part, rows in table.items()
+            part: {name: f"{row.title}; {row.chosen}" for name, row in rows.items()} for part, rows in table.items()
         },
+        "kernel": {part: {name: row.kernel for name, row in rows.items()} for part, rows in table.items()},
         "waits": {part: {name: row.waits for name, row in rows.items()} for part, rows in table.items()},
     }

@@ -102,7 +102,7 @@ class Layer(NamedTuple):
     gradient_at: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layout:
     """Where an actor-critic of one shape, and what learning needs beside it, lie in an array.
 
@@ -116,6 +116,11 @@ class Layout:
     size: int
     record_at: int
     places: dict[str, NDArray[np.int64]]
+
+    @functools.lru_cache(maxsize=32)  # noqa: B019 - layouts are few, and kept as long in any case
+    def all_places(self, names: tuple[str, ...]) -> NDArray[np.int64]:
+        """Where the numbers of all these parameters lie, one after another's."""
+        return np.concatenate([self.places[name] for name in names])
 
     @classmethod
     @functools.lru_cache(maxsize=32)

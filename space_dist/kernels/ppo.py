@@ -303,20 +303,53 @@ def evaluate(
             log_probs[first + row] = m[plan.shares_at + row]
 
 
+@entry
+def advantages(
+    rewards: Any, values: Any, starts: Any, last_values: Any, last_ends: Any, gamma: float, decay: float, found: Any
+) -> None:
+    """Generalised advantages as SB3's `RolloutBuffer` computes them, to the bit, into `found`.
+
+    rewards, values, starts (1 where a step begins an episode), found: (length, slots) of float32.  last_values,
+    last_ends: (slots,) behind the last step; if the former are of float64, SB3's sums are.  decay: gamma lambda.
+    """
+    length, slots = rewards.shape
+    one, discount, share = np.float32(1.0), np.float32(gamma), np.float32(decay)
+    for slot in range(slots):
+        last = length - 1
+        going_on = one - last_ends[slot]
+        delta = rewards[last, slot] + last_values.dtype.type(gamma) * last_values[slot] * going_on - values[last, slot]
+        following = delta + share * going_on * last_values.dtype.type(0.0)
+        found[last, slot] = following
+        for time in range(length - 2, -1, -1):
+            going_on = one - starts[time + 1, slot]
+            change = rewards[time, slot] + discount * values[time + 1, slot] * going_on - values[time, slot]
+            following = change + share * going_on * following
+            found[time, slot] = following
+
+
+class Entries(NamedTuple):
+    """What is compiled, for arrays of one type."""
+
+    update: Any
+    evaluate: Any
+    advantages: Any
+
+
 @functools.cache
-def prepare(dtype: Any) -> tuple[Any, Any]:
-    """`update` and `evaluate`, compiled for arrays of `dtype`, which are the only ones they then take."""
+def prepare(dtype: Any) -> Entries:
+    """All entries, compiled for arrays of `dtype`, which are the only ones they then take."""
     layout = Layout.of(Shape(1, 1, False, (1,), "tanh"), 1, np.dtype(dtype).itemsize)
     m, row, rows = np.zeros(1, dtype), np.zeros(1, dtype), np.zeros((1, 1), dtype)
     orders, told = np.zeros((1, 1), np.int64), np.zeros((1, TOLD))
     settings = Settings(0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
-    entries: tuple[Any, Any] = update, evaluate
+    entries, singles = Entries(update, evaluate, advantages), np.zeros((1, 1), np.float32)
     for one in entries:
         one.disable_compile(False)
     ready(
         [
             (update, (m, layout.plan, layout.layers, settings, row, orders, 1, told)),
             (evaluate, (m, layout.plan, layout.layers, row, orders[0], rows, row, row)),
+            (advantages, (singles, singles, singles, row, singles[0], 0.0, 0.0, singles)),
         ]
     )
     for one in entries:

@@ -146,7 +146,8 @@ class Learner(abc.ABC):
         before = self._gradient_steps()
         with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
             self._learn(shards, steps=steps)
-            if not all(torch.isfinite(parameter).all() for parameter in self.model.policy.parameters()):
+            numbers = torch.cat([parameter.detach().flatten() for parameter in self.model.policy.parameters()])
+            if not torch.isfinite(numbers).all():
                 raise ValueError(NOT_A_NUMBER)
         return self._learnt(shards, before)
 
@@ -269,7 +270,8 @@ def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], a
 def _seeded(seed: int, purpose: Purpose, *keys: int) -> Iterator[None]:
     """Python's, NumPy's and torch's global generators seeded for one piece of work, and restored."""
     with global_generators(seed, purpose, *keys), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(global_seeds(seed, purpose, *keys)[2])
+        # Not torch.manual_seed, which takes note of its caller for every kind of device that it does not find.
+        torch.default_generator.manual_seed(global_seeds(seed, purpose, *keys)[2])
         yield
 
 

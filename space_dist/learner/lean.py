@@ -8,7 +8,9 @@ holds losses, gradients, norms and weights against `PPO.train`.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.utils import explained_variance
 from torch import nn
 
@@ -26,29 +29,50 @@ Array = NDArray[np.floating[Any]]
 _ROWS = 64  # samples that are evaluated together; no result depends on it
 
 
+class LeanBuffer(RolloutBuffer):
+    """SB3's, with its advantages computed by a compiled function, to the bit."""
+
+    def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: NDArray[np.bool_]) -> None:
+        """See SB3's; last_values: (n_envs,) or (n_envs, 1)."""
+        last = last_values.numpy().flatten()
+        prepare(last.dtype).advantages(
+            self.rewards, self.values, self.episode_starts, last, dones.astype(np.float32), self.gamma,
+            self.gamma * self.gae_lambda, self.advantages,
+        )  # fmt: skip
+        self.returns = self.advantages + self.values
+
+
 class LeanPPO(PPO):
     """SB3's PPO for its own MlpPolicy."""
+
+    def _setup_model(self) -> None:
+        self.rollout_buffer_class = LeanBuffer
+        super()._setup_model()
+
+    @functools.cached_property
+    def network(self) -> Network:
+        """The policy, as the kernel takes it."""
+        return Network(self.policy)
 
     def train(self) -> None:
         """Update from the rollout buffer as `PPO.train` does, and record the same metrics."""
         self._update_learning_rate(self.policy.optimizer)
         buffer = self.rollout_buffer
-        network = Network(self.policy)
-        samples = network.packed(
+        samples = self.network.packed(
             *(buffer.swap_and_flatten(array) if not buffer.generator_ready else array
               for array in (buffer.observations, buffer.actions, buffer.log_probs, buffer.advantages, buffer.returns,
                             buffer.values))
         )  # fmt: skip
         orders = np.stack([np.random.permutation(len(samples)) for _ in range(self.n_epochs)])  # noqa: NPY002 - as SB3
-        report = network.update(samples, orders, self.batch_size, self._settings())
+        report = self.network.update(samples, orders, self.batch_size, self._settings())
         self._n_updates += report.epochs
         for name, value in self._metrics(report).items():
             self.logger.record(f"train/{name}", value)
 
     def evaluate(self, observations: Array, actions: NDArray[Any] | None = None) -> tuple[Array, Array]:
         """`(n, inputs), (n, ...) -> (n,), (n,)` values and actions' log-probabilities, to the bit as an update's."""
-        network = Network(self.policy)
-        return network.evaluate(network.packed(observations, np.zeros(()) if actions is None else actions))
+        packed = self.network.packed(observations, np.zeros(()) if actions is None else actions)
+        return self.network.evaluate(packed)
 
     def _settings(self) -> Settings:
         (group,) = self.policy.optimizer.param_groups
@@ -102,7 +126,8 @@ class Network:
     """An SB3 policy, and its optimiser's memory, laid out for the kernel; SB3's own stay the truth."""
 
     def __init__(self, policy: Any) -> None:
-        self._policy, self._parameters = policy, dict(policy.named_parameters())
+        self._policy, (self._names, self._parameters) = policy, zip(*policy.named_parameters(), strict=True)
+        self._sizes = [parameter.numel() for parameter in self._parameters]
         weight = policy.action_net.weight
         self._dtype, self._shape = weight.detach().numpy().dtype, shape_of(policy)
 
@@ -125,51 +150,50 @@ class Network:
         """Learn from the epochs' (epochs, n) permutations of samples in minibatches of `size`."""
         n = len(samples)
         layout = self._layout(min(size, n))
-        optimizer = self._policy.optimizer
-        steps = max((int(state["step"]) for state in optimizer.state.values()), default=0)
+        places, state = layout.all_places(self._names), self._policy.optimizer.state
+        steps = max((int(one["step"]) for one in state.values()), default=0)
         m = aligned(layout.size, self._dtype)
-        parts = list(m[: 4 * layout.plan.length].reshape(4, -1))
-        for name, parameter in self._parameters.items():
-            state = optimizer.state.get(parameter, {})
-            for part, tensor in zip(
-                (parts[0], parts[2], parts[3]), (parameter, state.get("exp_avg"), state.get("exp_avg_sq")), strict=True
-            ):
-                if tensor is not None:
-                    part[layout.places[name]] = tensor.detach().numpy().ravel()
+        parts = m[: 4 * layout.plan.length].reshape(4, -1)
+        parts[0, places] = _joined(self._parameters)
+        if state:
+            for part, moment in ((parts[2], "exp_avg"), (parts[3], "exp_avg_sq")):
+                part[places] = _joined([state[parameter][moment] for parameter in self._parameters])
         told = np.zeros((len(orders) * -(-n // size), TOLD))
-        update, _ = prepare(self._dtype)
-        done, made, epochs = update(
+        done, made, epochs = prepare(self._dtype).update(
             m, layout.plan, layout.layers, settings._replace(steps=steps), samples.ravel(), orders, size, told
         )
         self._keep(layout, parts, steps + made)
         return Report(told[:done], epochs, (epochs - 1) * -(-n // size))
 
-    def _keep(self, layout: Layout, parts: list[Array], steps: int) -> None:
+    def _keep(self, layout: Layout, parts: Array, steps: int) -> None:
         """Give policy and optimiser their numbers."""
-        for name, parameter in self._parameters.items():
-            weights, _, mean, square = (
-                torch.from_numpy(part[layout.places[name]]).view_as(parameter) for part in parts
-            )
-            with torch.no_grad():
-                parameter.copy_(weights)
-            self._policy.optimizer.state[parameter] = {
-                "step": torch.tensor(float(steps)), "exp_avg": mean, "exp_avg_sq": square,
-            }  # fmt: skip
+        numbers = parts[:, layout.all_places(self._names)]
+        weights, _, means, squares = (torch.split(torch.from_numpy(part), self._sizes) for part in numbers)
+        with torch.no_grad():
+            for parameter, weight, mean, square in zip(self._parameters, weights, means, squares, strict=True):
+                parameter.copy_(weight.view_as(parameter))
+                self._policy.optimizer.state[parameter] = {
+                    "step": torch.tensor(float(steps)),
+                    "exp_avg": mean.view_as(parameter), "exp_avg_sq": square.view_as(parameter),
+                }  # fmt: skip
 
     def evaluate(self, samples: Array) -> tuple[Array, Array]:
         """`(n, record) -> (n,), (n,)`: values, and the actions' log-probabilities."""
         n = len(samples)
         layout = self._layout(_ROWS)
         m = aligned(layout.size, self._dtype)
-        for name, parameter in self._parameters.items():
-            m[layout.places[name]] = parameter.detach().numpy().ravel()
+        m[layout.all_places(self._names)] = _joined(self._parameters)
         found = np.zeros((n, layout.plan.outputs), self._dtype), np.zeros(n, self._dtype), np.zeros(n, self._dtype)
-        _, evaluate = prepare(self._dtype)
-        evaluate(m, layout.plan, layout.layers, samples.ravel(), np.arange(n), *found)
+        prepare(self._dtype).evaluate(m, layout.plan, layout.layers, samples.ravel(), np.arange(n), *found)
         return found[1:]
 
     def _layout(self, rows: int) -> Layout:
         return Layout.of(self._shape, rows, self._dtype.itemsize)
+
+
+def _joined(tensors: Sequence[torch.Tensor]) -> Array:
+    """All their numbers, one after another."""
+    return np.concatenate([tensor.detach().numpy().ravel() for tensor in tensors])
 
 
 def shape_of(policy: Any) -> Shape:

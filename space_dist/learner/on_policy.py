@@ -28,6 +28,9 @@ _OURS = {
 }  # fmt: skip
 
 
+Values = NDArray[np.floating[Any]]
+
+
 @dataclass(frozen=True)
 class Joined:
     """The slots of all shards side by side: (length, slots, ...) each. ended: whether an episode did, at this step.
@@ -130,24 +133,24 @@ class OnPolicyLearner(Learner):
             flat_actions = torch.as_tensor(actions.reshape(length * n_slots, -1).astype(np.float32))
             if isinstance(self.model.action_space, spaces.Discrete):
                 flat_actions = flat_actions.long().flatten()
-            values, log_probs = self._evaluated(flat, flat_actions)
-            first = 0
-            for shard in shards:
-                if rows(shard.truncated_observations):
-                    behind = self._values(shard.truncated_observations)[:, 0]
-                    mine = np.argwhere(shard.truncated)
-                    rewards[mine[:, 0], mine[:, 1] + first] += self.model.gamma * behind
-                first += shard.rewards.shape[1]
-            last_values = torch.as_tensor(self._values(concatenate([shard.last_observations for shard in shards])))
+            beyond = [shard.truncated_observations for shard in shards]
+            beyond.append(concatenate([shard.last_observations for shard in shards]))
+            values, log_probs, (*behind, last_values) = self._evaluated(flat, flat_actions, beyond)
+        first = 0
+        for shard, after in zip(shards, behind, strict=True):
+            if len(after):
+                mine = np.argwhere(shard.truncated)
+                rewards[mine[:, 0], mine[:, 1] + first] += self.model.gamma * after
+            first += shard.rewards.shape[1]
         buffer.reset()
         put(buffer.observations, slice(None), observations)
         buffer.actions[:] = actions.reshape(buffer.actions.shape)
         buffer.rewards[:] = rewards
         buffer.episode_starts[:] = np.concatenate([joined.starts[None], ended[:-1]])
-        buffer.values[:] = values.numpy().reshape(length, n_slots)
-        buffer.log_probs[:] = log_probs.numpy().reshape(length, n_slots)
+        buffer.values[:] = values.reshape(length, n_slots)
+        buffer.log_probs[:] = log_probs.reshape(length, n_slots)
         buffer.pos, buffer.full = length, True
-        buffer.compute_returns_and_advantage(last_values=last_values, dones=ended[-1])
+        buffer.compute_returns_and_advantage(last_values=torch.as_tensor(last_values), dones=ended[-1])
         return buffer
 
     def joined(self, shards: Sequence[Shard]) -> Joined:
@@ -162,17 +165,32 @@ class OnPolicyLearner(Learner):
             np.concatenate([shard.starts for shard in shards]),
         )
 
-    def _values(self, observations: Observations) -> NDArray[np.float32]:
-        scaled = self.statistics.scaled(observations)
-        if isinstance(self.model, LeanPPO) and not isinstance(scaled, dict):
-            return self.model.evaluate(scaled)[0][:, None]
-        values: NDArray[np.float32] = self.model.policy.predict_values(tensors(scaled)).numpy()
-        return values
+    def _evaluated(
+        self, observations: Observations, actions: torch.Tensor, beyond: Sequence[Observations]
+    ) -> tuple[Values, Values, list[Values]]:
+        """`(n,), (n,)` values, and log-probabilities of (n, ...) actions, as the update that follows computes them.
 
-    def _evaluated(self, observations: Observations, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """`(n,), (n,)` values, and log-probabilities of (n, ...) actions, as the update that follows computes them."""
+        observations: at the scales that acted.  beyond: others, whose (k,) values are wanted as well.
+        """
+        scaled = [self.statistics.scaled(others) for others in beyond]
         if isinstance(self.model, LeanPPO) and not isinstance(observations, dict):
-            values, log_probs = self.model.evaluate(observations, actions.numpy())
-            return torch.from_numpy(values), torch.from_numpy(log_probs)
+            return self._evaluated_at_once(self.model, [observations, *scaled], actions.numpy())
         found, likelihoods, _ = self.model.policy.evaluate_actions(tensors(observations), actions)
-        return found, likelihoods
+        values = [
+            self.model.policy.predict_values(tensors(others)).numpy()[:, 0] if rows(others) else np.zeros(0, np.float32)
+            for others in scaled
+        ]
+        return found.numpy(), likelihoods.numpy(), values
+
+    @staticmethod
+    def _evaluated_at_once(
+        model: LeanPPO, parts: Sequence[Observations], actions: NDArray[Any]
+    ) -> tuple[Values, Values, list[Values]]:
+        observations, n = concatenate(parts), len(actions)
+        if isinstance(observations, dict):
+            raise TypeError("a multilayer perceptron takes flat observations")
+        all_actions = np.zeros((len(observations), *actions.shape[1:]), dtype=actions.dtype)
+        all_actions[:n] = actions
+        values, log_probs = model.evaluate(observations, all_actions)
+        ends = np.cumsum([rows(part) for part in parts])
+        return values[:n], log_probs[:n], np.split(values, ends[:-1])[1:]
