@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -82,6 +83,15 @@ def test_the_parts_are_the_control_store_and_this_nodes_raylet() -> None:
     assert parts(nodes, "b", "10.0.0.9:3") == {"the control store (GCS)": "10.0.0.9:3", "the raylet": "10.0.0.1:2"}
 
 
+def end(below: list[psutil.Process], run: subprocess.Popen[bytes]) -> None:
+    """Leave nothing of a test that failed."""
+    for process in below:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+    run.kill()
+    run.wait()
+
+
 @pytest.mark.ray
 @pytest.mark.parametrize(
     ("victim", "number", "said"),
@@ -117,12 +127,7 @@ def test_a_ray_that_hangs_or_dies_ends_a_run_with_75(
         status = Ledger(out).status()
         assert (status.state, said in str(status.message)) == ("interrupted", True)
     finally:
-        for process in [*below, run]:
-            try:
-                process.kill()
-            except (psutil.Error, ProcessLookupError):
-                continue
-        run.wait()
+        end(below, run)
 
 
 @pytest.mark.ray
@@ -154,9 +159,4 @@ def test_a_grid_whose_own_ray_dies_ends_with_75(tmp_path: Path) -> None:
         assert said in (tmp_path / "said").read_text()
         assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
     finally:
-        for process in [*below, run]:
-            try:
-                process.kill()
-            except (psutil.Error, ProcessLookupError):
-                continue
-        run.wait()
+        end(below, run)
