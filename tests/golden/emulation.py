@@ -65,9 +65,8 @@ def _environment(cpu: str) -> dict[str, str]:
     Compiling under an emulator takes minutes, and is the same work: only what is compiled runs on the CPU.
     """
     target = json.loads(_run([emulator() or "", "-cpu", cpu, sys.executable, "-c", _TARGET]))
-    folder = (
-        Path(tempfile.gettempdir()) / f"space-dist-golden-{os.getuid()}"
-    )  # kept: pytest's folders are others each time
+    # Kept from one run of the tests to the next, as pytest's own folders are not.
+    folder = Path(tempfile.gettempdir()) / f"space-dist-golden-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     environment = dict(os.environ) | target | {"NUMBA_CACHE_DIR": str(folder)}
     _run([sys.executable, "-c", _COMPILE], environment)
