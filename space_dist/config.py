@@ -322,10 +322,12 @@ class ValueDisagreementConfig(_Curriculum):
     case. Source: the SPaCE paper, section 5.2 (on Ant, VDS knows goals only)."""
     learning_rate: float = Field(default=1e-3, gt=0.0)
     """Step size of the members' Adam. Source: Zhang et al. 2020 (1e-3)."""
-    batch_size: int = Field(default=1000, ge=1)
-    """Transitions per minibatch of the members, at most a round's. Source: Zhang et al. 2020 (1,000)."""
-    n_batches: int = Field(default=100, ge=1)
-    """Minibatches per update. Source: Zhang et al. 2020 (100 a cycle)."""
+    batch_size: int = Field(default=256, ge=1)
+    """Transitions per minibatch of the members, at most a round's. Source: ours, as `n_batches` (Zhang et al. 2020:
+    1,000)."""
+    n_batches: int = Field(default=5, ge=1)
+    """Minibatches per update. Source: ours, the better of the settings that docs/curricula.md compares (Zhang et al.
+    2020: 100 a cycle)."""
     td_lambda: float = Field(default=0.95, ge=0.0, le=1.0)
     """Lambda of the returns that each member is fitted to, bootstrapped from itself. Source: ours; the original
     bootstraps Q-functions by one step (0), from a replay buffer."""
@@ -390,12 +392,13 @@ class LearnabilityConfig(_Curriculum):
     """Instances that are drawn as learnable. Source: ours, a fifth of 100 (the paper: 1,000 of 5,000)."""
     uniform_share: float = Field(default=0.5, ge=0.0, le=1.0)
     """Share of draws from all instances. Source: Rutherford et al. 2024 (0.5)."""
-    every: int = Field(default=50, ge=1)
+    every: int = Field(default=25, ge=1)
     """Iterations between probes, at least; the first follows the first training episode that succeeds: before, every
-    rate would be 0. Source: Rutherford et al. 2024 (50); the wait is ours."""
+    rate would be 0. Source: ours, with `episodes` the best of the settings that docs/curricula.md compares (Rutherford
+    et al. 2024: 50); the wait is ours."""
     candidates: int | None = Field(default=None, ge=1)
     """Instances that a probe takes, at random; null: all. Source: ours."""
-    episodes: int = Field(default=4, ge=2, le=1000)
+    episodes: int = Field(default=2, ge=2, le=1000)
     """Probe episodes of each candidate, with the acting policy. Source: ours."""
 
     @property

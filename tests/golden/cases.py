@@ -15,16 +15,18 @@ from space_dist.ledger import CURRICULUM, METRICS, VALUES
 ROOT = Path(__file__).resolve().parent.parent.parent
 DIGESTS = Path(__file__).with_name("digests.json")
 FILES = (METRICS, CURRICULUM, VALUES, "model.npz")
-_TRAIN, _TEST = 12, 4  # instances: enough to choose from, and cheap to emulate
+_TRAIN, _TEST = 12, 2  # instances: enough to choose from, and cheap to emulate
 
-# Few steps, each of many slots: what an emulator takes long for is Python, not arithmetic.
+# Few steps, each of many slots: what an emulator takes long for is Python, and then every sum.
 _SHORT = [
-    "budget.steps=768", "rollout.shards=2", "rollout.slots=4", "learner.n_steps=256", "env.kwargs.horizon=30",
+    "budget.steps=384", "rollout.shards=2", "rollout.slots=4", "learner.n_steps=128", "env.kwargs.horizon=12",
     "evaluation.every_steps=100000", "tracking.uri=null", "resources.workers=0",
 ]  # fmt: skip
 _PPO = [*_SHORT, "learner.n_epochs=2"]
-_LEAN = [*_PPO, "learner.update=lean"]
-_TRPO = "learner={kind: trpo, n_steps: 256, n_critic_updates: 2}"
+_SMALL = [*_PPO, "learner.net_arch=[16, 16]"]
+_LEAN = [*_SMALL, "learner.update=lean"]
+_BULLET = ["budget.steps=96", "learner.n_steps=48", "learner.batch_size=24", "rollout.slots=1"]  # a world a slot
+_TRPO = "learner={kind: trpo, n_steps: 128, n_critic_updates: 2, net_arch: [32, 32]}"
 _CONTINUOUS = "net_arch: [32, 32], batch_size: 32, learning_starts: 128, gradient_steps_per_step: 0.05"
 
 
@@ -40,30 +42,31 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "ppo": ("pointmass_space", [*_PPO, "curriculum.eta=4"]),
     "ppo relu, normalised": ("pointmass_space", [
         *_PPO, "learner.activation=relu", "learner.normalize_observations=true", "learner.normalize_rewards=true",
-        "budget.steps=1024",
+        "budget.steps=512",
     ]),
-    "ppo lean": ("pointmass_space", [*_LEAN, "learner.ent_coef=0.01", "learner.target_kl=0.02"]),
+    "ppo lean": ("pointmass_space", [
+        *_LEAN, "learner.net_arch=[40, 24]", "learner.ent_coef=0.01", "learner.target_kl=0.02",
+    ]),
     "ppo population": ("pointmass_space", [*_PPO, "engine=population", "curriculum.eta=4"]),
     "ppo shared curriculum": ("pointmass_space", [
-        *_PPO, "engine=population", "curriculum.aggregate=population", "curriculum.policies=2", "budget.steps=1536",
+        *_PPO, "engine=population", "curriculum.aggregate=population", "curriculum.policies=2", "budget.steps=768",
+        "learner.net_arch=[16, 16]",
     ]),
     "ppo overlap": ("pointmass_space", [*_PPO, "rollout.overlap=true"]),
     "trpo": ("pointmass_space", [*_SHORT, _TRPO]),
     "trpo population": ("pointmass_space", [*_SHORT, _TRPO, "engine=population"]),
-    "a2c": ("pointmass_space", [*_SHORT, "learner={kind: a2c, n_steps: 256}"]),
+    "a2c": ("pointmass_space", [*_SHORT, "learner={kind: a2c, n_steps: 128}"]),
     "dqn": ("cartpole_dqn_space", [
         "budget.steps=1000", "budget.episodes=20", "learner.learning_starts=200", "learner.net_arch=[32, 32]",
         "tracking.uri=null", "evaluation.episodes=1", "resources.workers=0",
     ]),
-    "sac": ("pointmass_space", [*_SHORT, f"learner={{kind: sac, n_steps: 256, {_CONTINUOUS}}}"]),
-    "td3": ("pointmass_space", [*_SHORT, f"learner={{kind: td3, n_steps: 256, {_CONTINUOUS}}}"]),
+    "sac": ("pointmass_space", [*_SHORT, f"learner={{kind: sac, n_steps: 128, {_CONTINUOUS}}}"]),
+    "td3": ("pointmass_space", [*_SHORT, f"learner={{kind: td3, n_steps: 128, {_CONTINUOUS}}}"]),
     # environments
-    "antgoal": ("antgoal_space", [*_PPO, "budget.steps=512"]),
-    "ballcatching": ("ballcatching_space", [
-        *(setting for setting in _PPO if "horizon" not in setting), "budget.steps=512", "learner.net_arch=[32, 32]",
-    ]),
+    "antgoal": ("antgoal_space", [*_SMALL, *_BULLET]),
+    "ballcatching": ("ballcatching_space", [*_SMALL, *_BULLET, "env.kwargs.horizon=20"]),
     "maze": ("maze_space", [
-        *_PPO, "env.kwargs.horizon=64", "learner.batch_size=64", "learner.net_arch=[32, 32]",
+        *_PPO, "env.kwargs.horizon=24", "learner.batch_size=64", "learner.net_arch=[32, 32]",
         "learner.update=stock",
     ]),
     # curricula
@@ -74,16 +77,16 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "manual": ("pointmass_space", [*_LEAN, _curriculum(f"kind: manual, column: {_COLUMN}, kappa: 2, eta: 4")]),
     "uniform": ("curricula/pointmass_uniform", _LEAN),
     "spdrl": ("curricula/pointmass_spdrl", [
-        *_LEAN, "budget.steps=1024", "curriculum.warm_up=1", "curriculum.offset=1",
+        *_LEAN, "budget.steps=512", "curriculum.warm_up=1", "curriculum.offset=1",
     ]),
     "vds": ("curricula/pointmass_vds", [*_LEAN, "curriculum.n_batches=4", "curriculum.batch_size=100"]),
     "alp_gmm": ("curricula/pointmass_alp_gmm", [
-        *_LEAN, "budget.steps=1280", "curriculum.fit_rate=12", "curriculum.components=3",
+        *_LEAN, "budget.steps=640", "curriculum.fit_rate=12", "curriculum.components=3",
     ]),
     "plr": ("curricula/pointmass_plr", _LEAN),
     "learnability": ("cartpole_dqn_space", [
-        *(setting for setting in _PPO if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
-        "learner={kind: ppo, n_steps: 256, n_epochs: 2}", "budget.steps=2048", "evaluation.episodes=1",
+        *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
+        "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024", "evaluation.episodes=1",
         _curriculum("kind: learnability, every: 2, episodes: 4, top: 2"),
     ]),
 }  # fmt: skip
