@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import os
@@ -14,6 +15,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
+import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -28,9 +30,12 @@ ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "configs/pointmass_space.yaml"
 TRAIN, TEST = (ROOT / f"configs/instances/pointmass_uniform_{split}.csv" for split in ("train", "test"))
 SMALL = (
-    "budget.steps=8192", "learner.n_steps=512", "rollout.slots=1", "learner.n_epochs=1", "tracking.uri=null",
-    "checkpoint.every_rounds=1", "evaluation.every_steps=3000", "resources.workers=0",
+    "budget.steps=4096", "learner.n_steps=256", "rollout.slots=1", "learner.n_epochs=1", "tracking.uri=null",
+    "checkpoint.every_rounds=1", "evaluation.every_steps=1500", "resources.workers=0",
 )  # fmt: skip
+
+
+once_made = functools.cache(typer.main.get_command)  # from signatures and help, which takes as long as most commands
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -52,6 +57,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 @pytest.fixture(autouse=True)
 def _own_arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(typer.main, "get_command", once_made)
     monkeypatch.setattr(sys, "argv", ["space-dist"])
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(runs, "STOP", StopRequests())
@@ -224,7 +230,7 @@ def test_a_run_that_is_there_is_neither_overwritten_nor_repeated(
     code, _, error = run(capsys, *train("curriculum.eta=0.2", "budget.steps=9000", out=finished), "--resume")
     assert code == 2
     assert "curriculum.eta: 0.1 -> 0.2" in error
-    assert "budget.steps: 8192 -> 9000" in error
+    assert "budget.steps: 4096 -> 9000" in error
     code, out, _ = run(capsys, *train(out=finished), "--resume")
     assert (code, "already done" in out) == (0, True)
     after = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
@@ -258,7 +264,7 @@ def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
     code, said = ended(process, tmp_path / "said")
     status = Ledger(folder).status()
     assert (code, status.state) == (75, "interrupted"), said
-    assert 0 < status.steps < 8192
+    assert 0 < status.steps < 4096
     assert "--resume continues" in said
     code, _, _ = run(capsys, *train(out=folder), "--resume")
     assert code == 0
@@ -302,7 +308,7 @@ def test_evaluate_gives_what_the_final_evaluation_of_a_policy_could_give(
     code, out, _ = run(capsys, "evaluate", finished, "--instances", TEST, "--json", "--out", results)
     assert code == 0
     answer = json.loads(out)
-    assert (answer["n_instances"], answer["steps"]) == (100, 8192)
+    assert (answer["n_instances"], answer["steps"]) == (100, 4096)
     rows = results.read_text().splitlines()
     assert rows[0] == "id,return,discounted_return,length,success"
     returns = [float(row.split(",")[1]) for row in rows[1:]]
