@@ -17,6 +17,26 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("RAY_worker_niceness", "0")  # beside other tests, the nice ones' turn would hardly ever come
 
+_MEMORY = Path("/dev/shm")  # noqa: S108 - pytest makes a folder of this user's own there
+_ENOUGH = 6 << 30  # bytes; what the tests write is a tenth of it, and Ray's objects live there, too
+
+
+def _keep_folders_in_memory() -> None:
+    """Have pytest make its folders where writing, renaming and removing a file takes no milliseconds, if there is room.
+
+    Runs force what they write to disk, a dozen files a round, and whole runs are made by the thousand here: on a disk
+    the tests wait for it for most of their time.
+    """
+    try:
+        found = os.statvfs(_MEMORY)
+    except OSError:
+        return
+    if found.f_bavail * found.f_frsize >= _ENOUGH and not found.f_flag & os.ST_NOEXEC and os.access(_MEMORY, os.W_OK):
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
+
+
+_keep_folders_in_memory()
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files that start Slurm, an emulator, Ray or servers come first: they take longest, and must not be begun last.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import os
@@ -10,9 +11,11 @@ import subprocess
 import sys
 import threading
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
+import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -20,15 +23,19 @@ from space_dist import cli
 from space_dist.cli import runs, terminal
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from tests import prepared
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "configs/pointmass_space.yaml"
 TRAIN, TEST = (ROOT / f"configs/instances/pointmass_uniform_{split}.csv" for split in ("train", "test"))
 SMALL = (
-    "budget.steps=8192", "learner.n_steps=512", "rollout.slots=1", "learner.n_epochs=1", "tracking.uri=null",
-    "checkpoint.every_rounds=1", "evaluation.every_steps=3000", "resources.workers=0",
+    "budget.steps=4096", "learner.n_steps=256", "rollout.slots=1", "learner.n_epochs=1", "tracking.uri=null",
+    "checkpoint.every_rounds=1", "evaluation.every_steps=1500", "resources.workers=0",
 )  # fmt: skip
+
+
+once_made = functools.cache(typer.main.get_command)  # from signatures and help, which takes as long as most commands
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -50,6 +57,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 @pytest.fixture(autouse=True)
 def _own_arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(typer.main, "get_command", once_made)
     monkeypatch.setattr(sys, "argv", ["space-dist"])
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(runs, "STOP", StopRequests())
@@ -105,12 +113,13 @@ def test_a_mistake_is_one_clear_sentence_and_exit_code_2(
 
 
 @pytest.mark.parametrize("setting", ["learner.update=lean", "engine=population"])
-def test_numba_that_may_not_compile_is_told_before_anything_begins(setting: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(setting, out=tmp_path / "run"))]
-    variables = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE, env=variables)
-    assert done.returncode == 2, done.stderr
-    (line,) = done.stderr.splitlines()
+def test_numba_that_may_not_compile_is_told_before_anything_begins(
+    setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    code, said = ended(prepared.command(train(setting, out=tmp_path / "run"), tmp_path / "said"), tmp_path / "said")
+    assert code == 2, said
+    (line,) = said.splitlines()
     for part in ("NUMBA_DISABLE_JIT is set", setting.replace("=", ": "), "unset it, or use learner.update: stock"):
         assert part in line
     assert not (tmp_path / "run").exists()
@@ -221,7 +230,7 @@ def test_a_run_that_is_there_is_neither_overwritten_nor_repeated(
     code, _, error = run(capsys, *train("curriculum.eta=0.2", "budget.steps=9000", out=finished), "--resume")
     assert code == 2
     assert "curriculum.eta: 0.1 -> 0.2" in error
-    assert "budget.steps: 8192 -> 9000" in error
+    assert "budget.steps: 4096 -> 9000" in error
     code, out, _ = run(capsys, *train(out=finished), "--resume")
     assert (code, "already done" in out) == (0, True)
     after = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
@@ -229,25 +238,34 @@ def test_a_run_that_is_there_is_neither_overwritten_nor_repeated(
     assert after == before
 
 
+def ended(process: BaseProcess, output: Path) -> tuple[int | None, str]:
+    """Exit code of a command, and what it said."""
+    process.join(PATIENCE)
+    return process.exitcode, output.read_text()
+
+
+def until_a_checkpoint(folder: Path) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.005)
+
+
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, "file"])
 def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
     capsys: pytest.CaptureFixture[str], finished: Path, tmp_path: Path, how: signal.Signals | str
 ) -> None:
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(out=folder))]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    deadline = time.monotonic() + PATIENCE
-    while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
-        time.sleep(0.005)
+    process = prepared.command(train(out=folder), tmp_path / "said")
+    until_a_checkpoint(folder)
     if isinstance(how, signal.Signals):
-        process.send_signal(how)
+        os.kill(process.pid or 0, how)
     else:
         (folder / "stop").touch()
-    _, error = process.communicate(timeout=PATIENCE)
+    code, said = ended(process, tmp_path / "said")
     status = Ledger(folder).status()
-    assert (process.returncode, status.state) == (75, "interrupted"), error
-    assert 0 < status.steps < 8192
-    assert "--resume continues" in error
+    assert (code, status.state) == (75, "interrupted"), said
+    assert 0 < status.steps < 4096
+    assert "--resume continues" in said
     code, _, _ = run(capsys, *train(out=folder), "--resume")
     assert code == 0
     assert same(folder, finished)
@@ -255,34 +273,28 @@ def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
 
 def test_a_second_process_on_the_same_run_refuses(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "space_dist.cli", *map(str, train("budget.steps=10000000", out=folder))]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
-        try:
-            deadline = time.monotonic() + PATIENCE
-            while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
-                time.sleep(0.01)
-            code, _, error = run(capsys, *train("budget.steps=10000000", out=folder), "--resume")
-            assert code == 1
-            assert f"process {first.pid}" in error
-            assert first.poll() is None
-        finally:
-            first.kill()
+    first = prepared.command(train("budget.steps=10000000", out=folder), tmp_path / "said")
+    try:
+        until_a_checkpoint(folder)
+        code, _, error = run(capsys, *train("budget.steps=10000000", out=folder), "--resume")
+        assert code == 1
+        assert f"process {first.pid}" in error
+        assert first.is_alive()
+    finally:
+        first.kill()
+        first.join()
 
 
 def test_a_round_longer_than_the_grace_time_ends_on_the_last_checkpoint(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    settings = ("resources.grace_seconds=0.3",)
-    command = [sys.executable, "-m", "space_dist.cli", *map(str, train(*settings, out=folder))]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + PATIENCE
-    while not list(folder.glob("checkpoints/*.npz")) and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.send_signal(signal.SIGSTOP)  # as if the round took for ever
-    process.send_signal(signal.SIGTERM)
-    process.send_signal(signal.SIGCONT)
-    assert process.wait(timeout=PATIENCE) == 75
-    done = subprocess.run([*command, "--resume"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0, done.stderr
+    command = train("resources.grace_seconds=0.3", out=folder)
+    process = prepared.command(command, tmp_path / "said")
+    until_a_checkpoint(folder)
+    for number in (signal.SIGSTOP, signal.SIGTERM, signal.SIGCONT):  # as if the round took for ever
+        os.kill(process.pid or 0, number)
+    assert ended(process, tmp_path / "said")[0] == 75
+    code, said = ended(prepared.command([*command, "--resume"], tmp_path / "then"), tmp_path / "then")
+    assert code == 0, said
     assert same(folder, finished)
 
 
@@ -296,7 +308,7 @@ def test_evaluate_gives_what_the_final_evaluation_of_a_policy_could_give(
     code, out, _ = run(capsys, "evaluate", finished, "--instances", TEST, "--json", "--out", results)
     assert code == 0
     answer = json.loads(out)
-    assert (answer["n_instances"], answer["steps"]) == (100, 8192)
+    assert (answer["n_instances"], answer["steps"]) == (100, 4096)
     rows = results.read_text().splitlines()
     assert rows[0] == "id,return,discounted_return,length,success"
     returns = [float(row.split(",")[1]) for row in rows[1:]]
@@ -348,10 +360,10 @@ def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixt
 
 def test_a_dead_tracking_server_costs_a_warning_and_nothing_else(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "space_dist.cli", *map(str, train("tracking.uri=http://127.0.0.1:9", out=folder))]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0
-    assert "warning: MLflow at http://127.0.0.1:9 could not be brought up to date" in done.stderr
+    command = train("tracking.uri=http://127.0.0.1:9", out=folder)
+    code, said = ended(prepared.command(command, tmp_path / "said"), tmp_path / "said")
+    assert code == 0
+    assert "warning: MLflow at http://127.0.0.1:9 could not be brought up to date" in said
     assert same(folder, finished)
 
 

@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -79,7 +80,19 @@ class Slurm:
 
 
 @pytest.fixture(scope="module")
-def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
+def disk() -> Iterator[Path]:
+    """In place of pytest's folders, which may be in /dev/shm (`conftest`): each node has another one there."""
+    with tempfile.TemporaryDirectory(prefix="space-dist-slurm-") as folder:
+        yield Path(folder).resolve()
+
+
+@pytest.fixture
+def tmp_path(disk: Path) -> Path:
+    return Path(tempfile.mkdtemp(dir=disk))
+
+
+@pytest.fixture(scope="module")
+def slurm(disk: Path) -> Iterator[Slurm]:
     installed = subprocess.run([HERE / "install.sh"], capture_output=True, text=True, timeout=PATIENCE)
     if installed.returncode:
         pytest.skip(f"Slurm cannot be installed here: {installed.stderr.strip().splitlines()[-1]}")
@@ -91,7 +104,8 @@ def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
         pytest.skip(
             f"Slurm's two nodes need namespaces and a bridge, which this machine refuses: {refused.stderr.strip()}"
         )
-    found = Slurm(tmp_path_factory.mktemp("slurm"))
+    found = Slurm(disk / "slurm")
+    found.folder.mkdir()
     try:
         up = subprocess.run([HERE / "up.sh", found.folder], capture_output=True, text=True, timeout=PATIENCE)
         assert up.returncode == 0, up.stdout + up.stderr
@@ -130,9 +144,9 @@ def write_grid(folder: Path, name: str, *, seeds: tuple[int, ...], **more: objec
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Grid:
+def reference(disk: Path) -> Grid:
     """Eight runs, done by `grid run` here."""
-    folder = tmp_path_factory.mktemp("here")
+    folder = disk / "here"
     grid = write_grid(folder, "eight", seeds=(0, 1), grid={"curriculum": list(KINDS)})
     space_dist("grid", "run", grid, "--root", folder / "runs")
     return Grid(folder / "runs/eight")
