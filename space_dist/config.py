@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import json
@@ -998,11 +999,7 @@ class _ValueFaultError(ValueError):
 def _parse_yaml(content: bytes | str, source: str) -> Any:
     try:
         text = content.decode() if isinstance(content, bytes) else content
-        yaml = YAML(typ="safe", pure=True)
-        yaml.Constructor = _Constructor
-        yaml.allow_duplicate_keys = False
-        _refuse_tricks(text, source)
-        return _plain(yaml.load(text))
+        return _plain(_loaded(text, source))
     except UnicodeDecodeError as error:
         raise ConfigError(f"{source} is not UTF-8 text (byte {error.start})") from None
     except DuplicateKeyError as error:
@@ -1021,6 +1018,16 @@ def _parse_yaml(content: bytes | str, source: str) -> Any:
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, NotImplementedError,
             AssertionError) as error:  # fmt: skip  # ruamel asserts that %YAML names a version it knows
         raise ConfigError(f"{source} is not valid YAML: {clean(str(error))}") from None
+
+
+@functools.lru_cache(maxsize=64)
+def _loaded(text: str, source: str) -> Any:
+    """What a YAML text says, for `_plain` to copy: ten milliseconds for a run's, which is read several times."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = _Constructor
+    yaml.allow_duplicate_keys = False
+    _refuse_tricks(text, source)
+    return yaml.load(text)
 
 
 def _refuse_tricks(text: str, source: str) -> None:

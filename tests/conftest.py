@@ -60,13 +60,22 @@ def _sb3_logs_in_pytests_folder(tmp_path_factory: pytest.TempPathFactory) -> Non
 
 @pytest.fixture(scope="session")
 def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database with MLflow's tables: making them takes seconds, so it happens once."""
+    """A database with MLflow's tables: making them takes seconds, so it happens once, for all of pytest's processes."""
+    from space_dist.files import locked
     from space_dist.tracking import sync
+    from tests.patience import PATIENCE
     from tests.test_report import start_run
 
-    folder = tmp_path_factory.mktemp("store")
-    sync([start_run(folder / "run")], f"sqlite:///{folder / 'mlflow.db'}", "unused")
-    return folder / "mlflow.db"
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    made = folder / "empty_store.db"
+    with locked(folder / "empty_store.lock", PATIENCE):
+        if not made.exists():
+            own = tmp_path_factory.mktemp("store")
+            sync([start_run(own / "run")], f"sqlite:///{own / 'mlflow.db'}", "unused")
+            (own / "mlflow.db").rename(made)
+    return made
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import hashlib
 import json
@@ -150,12 +151,17 @@ def read_config(ledger: Ledger) -> dict[str, Any]:
     Raises LedgerError if it is missing, damaged, or not a YAML mapping.
     """
     try:
-        data = YAML(typ="safe", pure=True).load(ledger.read(ledger.config).decode())
+        data = copy.deepcopy(_loaded(ledger.read(ledger.config)))
     except (YAMLError, ValueError, RecursionError):
         raise LedgerError(f"{ledger.config} is damaged: it is not valid YAML") from None
     if not isinstance(data, dict):
         raise LedgerError(f"{ledger.config} is damaged: it holds no keys and values")
     return data
+
+
+@functools.lru_cache(maxsize=64)
+def _loaded(content: bytes) -> Any:
+    return YAML(typ="safe", pure=True).load(content.decode())
 
 
 def load_run(ledger: Ledger, config: Mapping[str, Any] | None = None) -> Run:
