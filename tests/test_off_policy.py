@@ -252,8 +252,10 @@ def test_the_ring_is_stable_baselines3s(kind: str, capacity: int) -> None:
     assert (learner.seen, learner.capacity) == (STEPS, capacity)
 
 
-@pytest.mark.parametrize("capacity", [7, 33, 256, 1000])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(  # the ring is the same for all kinds
+    ("kind", "capacity"),
+    [("dqn", 7), ("dqn", 33), ("dqn", 256), ("dqn", 1000), ("sac", 7), ("sac", 256), ("td3", 33), ("td3", 1000)],
+)
 def test_pieces_restore_the_buffer_and_all_that_follows(kind: str, capacity: int) -> None:
     rounds = rounds_of(stream_for(kind))
     learner = learner_for(kind, buffer_size=capacity)
@@ -276,9 +278,9 @@ def test_pieces_restore_the_buffer_and_all_that_follows(kind: str, capacity: int
             again.remember(piece, first)
     assert buffer_of(again) == buffer_of(learner)
     assert again.seen == learner.seen
-    expected = learn(learner, rounds, first=20)
-    assert learn(again, rounds, first=20) == expected
-    assert sum(update.gradient_steps for update in expected) == 100
+    expected = learn(learner, rounds[:25], first=20)
+    assert learn(again, rounds[:25], first=20) == expected
+    assert sum(update.gradient_steps for update in expected) == 50
     assert buffer_of(again) == buffer_of(learner)
     for name, array in learner.save()[0].items():
         np.testing.assert_array_equal(again.save()[0][name], array, err_msg=name)

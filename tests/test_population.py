@@ -147,10 +147,10 @@ def test_what_a_member_takes_of_the_memory_is_foreseen(kind: str, tmp_path: Path
                            for split in ("train", "test")}}  # fmt: skip
     path = tmp_path / "config.yaml"
     path.write_text(to_yaml(data))
-    command = [sys.executable, "-m", "tests.population_memory", path, "4", "20"]
+    command = [sys.executable, "-m", "tests.population_memory", path, "4", "12"]
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     few, many = map(int, said.split())
-    each = (many - few) / 16 / 2**20
+    each = (many - few) / 8 / 2**20
     assert each <= memory_of(load(path)) <= 3 * each
 
 

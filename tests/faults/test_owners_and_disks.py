@@ -13,6 +13,7 @@ import pytest
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from tests import prepared
 from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
 from tests.faults.test_requests import ROOT, command
@@ -55,6 +56,13 @@ def test_of_two_processes_on_two_hosts_one_works_and_the_other_says_why(tmp_path
     assert Ledger(tmp_path / "run").status().state == "done"
 
 
+def ended(train: list[str], output: Path) -> tuple[int | None, str]:
+    """Exit code of a `python -m space_dist.cli ...` that is forked instead, and what it said."""
+    process = prepared.command(list(train[3:]), output)
+    process.join(PATIENCE)
+    return process.exitcode, output.read_text()
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of its own, so small that a run does not fit on it."""
@@ -70,28 +78,28 @@ def test_a_full_disk_is_one_sentence_and_the_run_goes_on_once_there_is_room(tmp_
     config = short(tmp_path, "ppo", 4)
     launch(config, tmp_path / "reference", resume=True, stop=StopRequests())
     train = [*command(tmp_path)[:-2], "--out", str(small_disk / "run")]
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 1
-    assert "the disk is full" in done.stderr
-    assert "Traceback" not in done.stderr
+    code, said = ended(train, tmp_path / "full")
+    assert code == 1
+    assert "the disk is full" in said
+    assert "Traceback" not in said
     assert can("mount", "-o", "remount,size=4m", str(small_disk))
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0, done.stderr
+    code, said = ended(train, tmp_path / "done")
+    assert code == 0, said
     assert results(small_disk / "run") == results(tmp_path / "reference")
 
 
 def test_a_read_only_folder_is_one_sentence(tmp_path: Path, small_disk: Path) -> None:
     assert can("mount", "-o", "remount,ro", str(small_disk))
     train = [*command(tmp_path)[:-2], "--out", str(small_disk / "run")]
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 1
-    assert "the file system is read-only" in done.stderr
-    assert "Traceback" not in done.stderr
+    code, said = ended(train, tmp_path / "read-only")
+    assert code == 1
+    assert "the file system is read-only" in said
+    assert "Traceback" not in said
     assert list(small_disk.iterdir()) == []
 
 
 def test_a_dead_tracking_server_is_a_warning(tmp_path: Path) -> None:
     train = command(tmp_path, "tracking.uri=http://127.0.0.1:9", "tracking.live=false")
-    done = subprocess.run(train, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0, done.stderr
+    code, said = ended(train, tmp_path / "done")
+    assert code == 0, said
     assert Ledger(tmp_path / "run").status().state == "done"
