@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,12 @@ _CONTEXT.set_forkserver_preload(["space_dist.cli.runs", "space_dist.launch", "to
 _ROOT = Path(__file__).resolve().parent.parent
 
 
-def command(arguments: list[object], output: Path) -> BaseProcess:
-    """`space-dist ARGUMENTS` in the repository's folder; what it says is appended to the file `output`."""
-    return _started(_command, [str(argument) for argument in arguments], str(output), dict(os.environ))
+def command(arguments: list[object], output: Path, before: Callable[[], None] | None = None) -> BaseProcess:
+    """`space-dist ARGUMENTS` in the repository's folder; what it says is appended to the file `output`.
+
+    before: a function of a module, called in the new process first.
+    """
+    return _started(_command, [str(argument) for argument in arguments], str(output), dict(os.environ), before)
 
 
 def slow_run(config: Path, folder: Path, seconds: float) -> BaseProcess:
@@ -35,7 +39,7 @@ def _started(target: Any, *arguments: Any) -> BaseProcess:
     return process
 
 
-def _command(arguments: list[str], output: str, environment: dict[str, str]) -> None:
+def _command(arguments: list[str], output: str, environment: dict[str, str], before: Callable[[], None] | None) -> None:
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(_ROOT)
@@ -44,6 +48,8 @@ def _command(arguments: list[str], output: str, environment: dict[str, str]) -> 
         os.dup2(descriptor, standard)
     from space_dist import cli
 
+    if before is not None:
+        before()
     sys.argv = ["space-dist", *arguments]
     cli.main()
 

@@ -80,7 +80,7 @@ def test_repeated_it_is_the_same_and_another_seed_is_not(reference: tuple[str, P
 
 @pytest.mark.ray
 def test_killed_five_times_and_resumed_it_is_the_same(reference: tuple[str, Path], tmp_path: Path) -> None:
-    """The last kill hits a run that has a Ray of its own, whose actors must not outlive it; so has what goes on then."""
+    """The last kill hits a run with a Ray of its own, whose actors must not outlive it; what goes on then has one."""
     learner, folder = reference
     out = tmp_path / "run"
     moments = random.Random(f"kills of {learner}")

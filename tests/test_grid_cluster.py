@@ -57,38 +57,38 @@ def metrics(grid: Grid, runs: list[Run]) -> list[bytes]:
     return [(grid.ledger(run).folder / METRICS).read_bytes() for run in runs]
 
 
-def test_twelve_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_path: Path) -> None:
-    path = write_grid(tmp_path, seeds={"count": 6})
+def test_six_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_path: Path) -> None:
+    path = write_grid(tmp_path, seeds={"count": 3})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", "jobs")
     both = [start(cluster, *submit) for _ in range(2)]
     said = [process.communicate(timeout=PATIENCE)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
-    assert all("small: 12 of 12 runs done" in text for text in said)
+    assert all("small: 6 of 6 runs done" in text for text in said)
     grid = Grid(tmp_path / "runs/small")
     runs = grid.manifest().runs()
-    assert begun(grid, runs) == [1] * 12
+    assert begun(grid, runs) == [1] * 6
     jobs = [job for job in cluster.ask("/api/jobs/") if (job["metadata"] or {}).get("folder") == str(grid.folder)]
     assert sorted(job["submission_id"] for job in jobs) == sorted(f"small-{run.cell.id}-s{run.seed}-a1" for run in runs)
     assert {job["metadata"]["code"] for job in jobs} == {grid.manifest().code}
     assert all("/" not in job["submission_id"] for job in jobs)
     before = metrics(grid, runs)
     again = start(cluster, *submit)
-    assert "12 of 12 runs done" in again.communicate(timeout=PATIENCE)[0]
+    assert "6 of 6 runs done" in again.communicate(timeout=PATIENCE)[0]
     assert again.returncode == 0
-    assert begun(grid, runs) == [1] * 12
+    assert begun(grid, runs) == [1] * 6
     assert metrics(grid, runs) == before
     local = start(cluster, "grid", "run", path, "--root", tmp_path / "local")
-    assert "12 of 12 runs done" in local.communicate(timeout=PATIENCE)[0]
+    assert "6 of 6 runs done" in local.communicate(timeout=PATIENCE)[0]
     elsewhere = Grid(tmp_path / "local/small")
     assert metrics(elsewhere, elsewhere.manifest().runs()) == before
     status = start(cluster, "grid", "status", grid.folder, "--json")
-    assert json.loads(status.communicate(timeout=PATIENCE)[0])["counts"] == {"done": 12}
+    assert json.loads(status.communicate(timeout=PATIENCE)[0])["counts"] == {"done": 6}
     assert status.returncode == 0
 
 
 @pytest.mark.parametrize("mode", ["jobs", "pool"])
 def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHead, tmp_path: Path, mode: str) -> None:
-    path = write_grid(tmp_path, seeds={"count": 3})
+    path = write_grid(tmp_path, seeds={"count": 2})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", mode)
     submitter = start(cluster, *submit)
     grid = Grid(tmp_path / "runs/small")
@@ -98,9 +98,9 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHe
         runs = grid.manifest().runs() if grid.manifest_file.exists() else []
         return sum(grid.ledger(run).status_file.exists() and grid.ledger(run).status().state == "done" for run in runs)
 
-    while done() < 2 and time.monotonic() < deadline:
+    while done() < 1 and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert done() < 6, "killed too late to show anything"
+    assert done() < 4, "killed too late to show anything"
     submitter.kill()
     submitter.communicate()
     conductor = [process for process in psutil.process_iter(["cmdline"])
@@ -112,14 +112,14 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHe
     again = start(cluster, *submit)
     said = again.communicate(timeout=PATIENCE)[0]
     assert again.returncode == 0, said
-    assert "6 of 6 runs done" in said
+    assert "4 of 4 runs done" in said
     runs = grid.manifest().runs()
     finished_once = [
         sum(row["event"] == "end" and row["cause"] is None for row in Attempts(grid.ledger(run)).rows()) for run in runs
     ]
-    assert finished_once == [1] * 6
+    assert finished_once == [1] * 4
     if mode == "jobs":  # they outlive their conductor
-        assert begun(grid, runs) == [1] * 6
+        assert begun(grid, runs) == [1] * 4
 
 
 def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayHead, tmp_path: Path) -> None:

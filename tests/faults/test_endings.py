@@ -17,6 +17,7 @@ from space_dist.launch import launch
 from space_dist.ledger import Ledger
 from space_dist.report import load_run
 from space_dist.report.load import standing
+from tests import prepared
 from tests.patience import PATIENCE
 from tests.test_learners import config_for, learner_section, results
 
@@ -28,6 +29,20 @@ def faulty(folder: Path, fault: str, **more: Any) -> configs.RunConfig:
     env = {"id": "tests.fault_env:make", "kwargs": {"fault": fault, "marker": str(folder / "marker"), **more}}
     section = learner_section("ppo", n_steps=32, net_arch=[4])
     return config_for(folder, section, env=env, budget={"steps": 960}, rollout={"shards": 2, "slots": 2})
+
+
+def forked(folder: Path, *arguments: object) -> tuple[int | None, str]:
+    """The exit code of `space-dist ARGUMENTS`, whose end as a process is not what is tested, and what it said."""
+    said = folder / "said.txt"
+    said.unlink(missing_ok=True)
+    process = prepared.command(list(arguments), said)
+    process.join(PATIENCE)
+    return process.exitcode, said.read_text()
+
+
+def resume(folder: Path, fault: str) -> tuple[int | None, str]:
+    (folder / "config.yaml").write_text(configs.dump(faulty(folder, fault, where="step", after=0)))
+    return forked(folder, "train", folder / "config.yaml", "--resume", "--out", folder / "run")
 
 
 def train(
@@ -59,7 +74,7 @@ def test_an_exit_with_0_is_a_failure(
     status = Ledger(tmp_path / "run").status()
     assert status.state == "failed"
     assert words in str(status.message)
-    assert train(tmp_path, fault).returncode == 0  # once is enough
+    assert resume(tmp_path, fault)[0] == 0  # once is enough
     assert results(tmp_path / "run") == unharmed
 
 
@@ -91,12 +106,9 @@ def test_an_exit_from_c_leaves_a_run_that_is_seen_to_be_abandoned(unharmed: dict
     ledger = Ledger(tmp_path / "run")
     assert ledger.abandoned(ledger.status())
     assert "left behind by a process that is gone" in standing(load_run(ledger))
-    said = subprocess.run(
-        [sys.executable, "-m", "space_dist.cli", "evaluate", str(ledger.folder), "--json", "--instances",
-         str(tmp_path / "test.csv")], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE,
-    )  # fmt: skip
-    assert '"state": "abandoned"' in said.stdout
-    assert train(tmp_path, "exit from C").returncode == 0
+    said = forked(tmp_path, "evaluate", ledger.folder, "--json", "--instances", tmp_path / "test.csv")[1]
+    assert '"state": "abandoned"' in said
+    assert resume(tmp_path, "exit from C")[0] == 0
     assert results(tmp_path / "run") == unharmed
 
 
@@ -123,10 +135,10 @@ def test_a_run_folder_with_a_link_is_refused_in_a_sentence(name: str, tmp_path: 
     (tmp_path / "precious").write_text("precious")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / name).symlink_to(tmp_path / "precious")
-    done = train(tmp_path, "none")
-    assert done.returncode == 1
-    assert f"{name} is a link" in done.stderr
-    assert "Traceback" not in done.stderr
+    code, said = resume(tmp_path, "none")
+    assert code == 1
+    assert f"{name} is a link" in said
+    assert "Traceback" not in said
     assert (tmp_path / "precious").read_text() == "precious"
 
 

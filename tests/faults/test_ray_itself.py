@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import psutil
@@ -20,15 +20,16 @@ from space_dist.config import to_yaml
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import Ledger
 from space_dist.ray_watch import Started, asked, parts, reach
+from tests import prepared
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
-IMPATIENT = (
-    "from space_dist import ray_watch as watch; watch.SILENT_SECONDS = 8.0; watch._ASK_SECONDS = 2.0; "
-    "from space_dist.cli import main; main()"
-)
-RUN = ["train", str(ROOT / "configs/pointmass_space.yaml"), "--workers", "1"]
+RUN: list[object] = ["train", ROOT / "configs/pointmass_space.yaml", "--workers", 1]
 SMALL = ["learner.n_steps=512", "rollout.slots=1", "evaluation.every_steps=1000000", "tracking.uri=null"]
+
+
+def impatient() -> None:
+    ray_watch.SILENT_SECONDS, ray_watch._ASK_SECONDS = 8.0, 2.0
 
 
 @pytest.fixture
@@ -83,13 +84,18 @@ def test_the_parts_are_the_control_store_and_this_nodes_raylet() -> None:
     assert parts(nodes, "b", "10.0.0.9:3") == {"the control store (GCS)": "10.0.0.9:3", "the raylet": "10.0.0.1:2"}
 
 
-def end(below: list[psutil.Process], run: subprocess.Popen[bytes]) -> None:
+def ended(run: BaseProcess) -> int | None:
+    run.join(PATIENCE)
+    return run.exitcode
+
+
+def end(below: list[psutil.Process], run: BaseProcess) -> None:
     """Leave nothing of a test that failed."""
     for process in below:
         with contextlib.suppress(psutil.Error):
             process.kill()
     run.kill()
-    run.wait()
+    run.join()
 
 
 @pytest.mark.ray
@@ -107,20 +113,16 @@ def test_a_ray_that_hangs_or_dies_ends_a_run_with_75(
 ) -> None:
     out = tmp_path / "run"
     settings = [word for setting in SMALL for word in ("--set", setting)]
-    with (tmp_path / "said").open("wb") as output:
-        run = subprocess.Popen(
-            [sys.executable, "-c", IMPATIENT, *RUN, "--out", str(out), *settings], cwd=ROOT,
-            stdout=output, stderr=output, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
+    run = prepared.command([*RUN, "--out", out, *settings], tmp_path / "said", impatient)
     below: list[psutil.Process] = []
     try:
         deadline = time.monotonic() + PATIENCE
-        while not (out / "metrics.jsonl").exists() and run.poll() is None and time.monotonic() < deadline:
+        while not (out / "metrics.jsonl").exists() and run.is_alive() and time.monotonic() < deadline:
             time.sleep(0.2)
         below = psutil.Process(run.pid).children(recursive=True)
         (hit,) = [process for process in below if process.name() == victim]
         hit.send_signal(number)
-        assert run.wait(PATIENCE) == 75
+        assert ended(run) == 75
         assert said in (out / "log.txt").read_text()
         assert said in (tmp_path / "said").read_text()
         assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
@@ -141,21 +143,17 @@ def test_a_grid_whose_own_ray_dies_ends_with_75(tmp_path: Path) -> None:
         "resources": {"workers": 1}, "tracking": {"uri": None},
     }))  # fmt: skip
     said, below = "the control store (GCS) of the Ray of our own has died", list[psutil.Process]()
-    with (tmp_path / "said").open("wb") as output:
-        run = subprocess.Popen(
-            [sys.executable, "-c", IMPATIENT, "grid", "run", str(grid), "--root", str(tmp_path)], cwd=ROOT,
-            stdout=output, stderr=output, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
+    run = prepared.command(["grid", "run", grid, "--root", tmp_path], tmp_path / "said", impatient)
     try:
         deadline = time.monotonic() + PATIENCE
-        while not [*tmp_path.glob("orphan/*/s0/metrics.jsonl")] and run.poll() is None and time.monotonic() < deadline:
+        while not [*tmp_path.glob("orphan/*/s0/metrics.jsonl")] and run.is_alive() and time.monotonic() < deadline:
             time.sleep(0.2)
-        assert run.poll() is None, (tmp_path / "said").read_text()
+        assert run.is_alive(), (tmp_path / "said").read_text()
         below = psutil.Process(run.pid).children(recursive=True)
         for process in below:
             if process.name() == "gcs_server":
                 process.kill()
-        assert run.wait(PATIENCE) == 75, (tmp_path / "said").read_text()
+        assert ended(run) == 75, (tmp_path / "said").read_text()
         assert said in (tmp_path / "said").read_text()
         assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
     finally:

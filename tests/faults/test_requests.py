@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import psutil
@@ -16,6 +17,7 @@ from space_dist import config as configs
 from space_dist.interrupts import STOP_SIGNALS, StopRequests
 from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from tests import prepared
 from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
 from tests.patience import PATIENCE
@@ -65,34 +67,37 @@ def test_handlers_stand_while_something_would_replace_them() -> None:
             signal.signal(number, handler)
 
 
-def command(tmp_path: Path, *settings: str, env: str | None = None) -> list[str]:
+def command(tmp_path: Path, *settings: str, env: str | None = None) -> list[object]:
     config = short(tmp_path, "ppo", 4)
     if env is not None:
         config = config.model_copy(update={"env": config.env.model_copy(update={"id": env})})
     (tmp_path / "config.yaml").write_text(configs.dump(config))
-    made = [sys.executable, "-m", "space_dist.cli", "train", str(tmp_path / "config.yaml"), "--resume"]
-    made += ["--out", str(tmp_path / "run")]
+    made: list[object] = ["train", tmp_path / "config.yaml", "--resume", "--out", tmp_path / "run"]
     for setting in settings:
         made += ["--set", setting]
     return made
 
 
-def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(tmp_path: Path) -> None:
+def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slow = command(
         tmp_path, "resources.grace_seconds=0.3", "evaluation.every_steps=100000", env="tests.faults.slow_env:make"
     )
-    process = subprocess.Popen(slow, cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, PAUSE: "0.3"})
+    monkeypatch.setenv(PAUSE, "0.3")
+    process, said = prepared.command(slow, tmp_path / "said.txt"), tmp_path / "said.txt"
+    monkeypatch.delenv(PAUSE)
     try:
         deadline = time.monotonic() + PATIENCE
         while not list((tmp_path / "run" / "checkpoints").glob("round-*2.npz")) and time.monotonic() < deadline:
             time.sleep(0.01)
-            assert process.poll() is None
-        process.send_signal(signal.SIGUSR1)
-        _, said = process.communicate(timeout=PATIENCE)
+            assert process.is_alive()
+        send(process, signal.SIGUSR1)
+        process.join(PATIENCE)
     finally:
         process.kill()
-    assert process.returncode == 75, said
-    assert "Traceback" not in said
+    assert process.exitcode == 75, said.read_text()
+    assert "Traceback" not in said.read_text()
     status = Ledger(tmp_path / "run").status()
     assert status.checkpoint == "round-000000002.npz"
     config = configs.load(tmp_path / "config.yaml", ["evaluation.every_steps=100000"])
@@ -105,11 +110,9 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
 @pytest.mark.parametrize("progress", [0.0, 0.5, 1.0, None])
 def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float | None) -> None:
     """Once, at some moment; or (None) ever again, so that there is no moment at which it has not come."""
-    process = subprocess.Popen(
-        command(tmp_path, "resources.workers=1", "budget.steps=320000", "resources.grace_seconds=100"),
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-        text=True,
+    said = tmp_path / "said.txt"
+    process = prepared.command(
+        command(tmp_path, "resources.workers=1", "budget.steps=320000", "resources.grace_seconds=100"), said
     )
     try:
         log, deadline = tmp_path / "run" / "log.txt", time.monotonic() + PATIENCE
@@ -120,17 +123,22 @@ def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float |
             while not any(child.name() == "gcs_server" for child in watched.children()):
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
-            while process.poll() is None:
+            while process.is_alive():
                 assert time.monotonic() < deadline
-                process.send_signal(signal.SIGTERM)
+                send(process, signal.SIGTERM)
                 time.sleep(0.01)
         else:
             time.sleep(4.0 * progress)
-            process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=PATIENCE)
+            send(process, signal.SIGTERM)
+        process.join(PATIENCE)
     finally:
         process.kill()
-    assert process.returncode == 75, said
-    assert "stopped by SIGTERM" in said
+    assert process.exitcode == 75, said.read_text()
+    assert "stopped by SIGTERM" in said.read_text()
     assert Ledger(tmp_path / "run").status().state == "interrupted"
     assert os.environ.get("RAY_ADDRESS") is None
+
+
+def send(process: BaseProcess, number: signal.Signals) -> None:
+    assert process.pid is not None
+    os.kill(process.pid, number)

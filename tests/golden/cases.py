@@ -86,7 +86,8 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "plr": ("curricula/pointmass_plr", _LEAN),
     "learnability": ("cartpole_dqn_space", [
         *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
-        "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024", "evaluation.episodes=1",
+        "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024",
+        "evaluation.episodes=1",
         _curriculum("kind: learnability, every: 2, episodes: 4, top: 2"),
     ]),
 }  # fmt: skip

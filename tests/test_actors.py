@@ -1,0 +1,122 @@
+"""Ray actors: what they import and compute with, and that losing one changes nothing but time."""
+
+# ruff: noqa: F811 - fixtures that are imported
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from space_dist.arithmetic import digest, scipy_probes
+from space_dist.errors import SpaceDistError
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch, read_instances
+from space_dist.ledger import METRICS, Ledger
+from space_dist.training import learner_of, make_setup
+from tests.patience import PATIENCE
+from tests.test_distributed import cluster_class, config, reference, results  # noqa: F401
+from tests.test_learners import config_for, learner_section
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("one_ray")]
+
+
+def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -> None:
+    import ray
+
+    run = config(1)
+    setup = make_setup(run, *read_instances(run))
+    with cluster_class(run, setup) as cluster:
+        policy = cluster.put(learner_of(run).policy(0))
+        decision = cluster.begin(cluster.start_values(policy))
+        from space_dist.walk import Walk
+
+        shards = cluster.collect(policy, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
+        assert len(cluster.get([*shards, *cluster.evaluate(policy, "test")])) == 2 * run.rollout.shards
+        for actor in cluster._actors.values():
+            # By value: a function of this module would make the actor import it, and all that it imports.
+            names = ray.get(actor.__ray_call__.remote(lambda self: list(__import__("sys").modules)))
+            modules = {name.partition(".")[0] for name in names}
+            assert "numpy" in modules
+            assert not modules & {"torch", "stable_baselines3", "sb3_contrib", "mlflow"}
+
+
+@pytest.mark.parametrize("victims", [(0,), (-1,), (0, 1, -1)], ids=["a rollout actor", "the curriculum actor", "all"])
+def test_killed_actors_are_replaced_and_change_nothing(
+    victims: tuple[int, ...], cluster_class: Any, reference: dict[str, bytes], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    import ray
+
+    killed: list[int] = []
+    collect: Callable[..., list[Any]] = cluster_class.collect
+
+    def kill_then_collect(self: Any, *arguments: Any, round: int, **options: Any) -> list[Any]:
+        handles = collect(self, *arguments, round=round, **options)
+        if round in (2, 5):  # while the shards, and the decision they need, are under way
+            for victim in victims:
+                ray.kill(self._actors[victim])
+                killed.append(victim)
+        return handles
+
+    monkeypatch.setattr(cluster_class, "collect", kill_then_collect)
+    launch(config(2), tmp_path, resume=True, stop=StopRequests())
+    assert killed == [*victims, *victims]
+    assert results(tmp_path) == reference
+    assert "computing it again" in (tmp_path / "log.txt").read_text()
+
+
+def test_a_stop_request_ends_a_run_on_ray_with_a_checkpoint(reference: dict[str, bytes], tmp_path: Path) -> None:
+    from space_dist.errors import Interrupted
+
+    def stop_soon() -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not (tmp_path / METRICS).exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        (tmp_path / "stop").touch()
+
+    thread = threading.Thread(target=stop_soon)
+    thread.start()
+    with pytest.raises(Interrupted):
+        launch(config(1), tmp_path, resume=True, stop=StopRequests())
+    thread.join()
+    status = Ledger(tmp_path).status()
+    assert (status.state, status.steps < 8192) == ("interrupted", True)
+    launch(config(0), tmp_path, resume=True, stop=StopRequests())
+    assert results(tmp_path) == reference
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kind", "rollout", "central"),
+    [
+        ("tests.tiny_env:make", "space", (), ()),
+        ("tests.tiny_env:make_dict", "space", ("torch",), ()),
+        ("tests.tiny_env:make", "spdrl", (), ("scipy",)),
+        ("tests.tiny_env:make", "alp_gmm", (), ("scipy", "scikit-learn")),
+    ],
+)
+def test_actors_are_compared_by_all_that_they_compute_with(
+    env_id: str, kind: str, rollout: tuple[str, ...], central: tuple[str, ...], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    from space_dist import distributed
+
+    policy = {"policy": "MultiInputPolicy"} if env_id.endswith("dict") else {}
+    config = config_for(tmp_path, learner_section("ppo", **policy), env_id)
+    setup = make_setup(config, *read_instances(config))
+    section = type("Section", (), {"kind": kind})()
+    config = config.model_copy(update={"curriculum": section})
+    for wanted, is_central in ((rollout, False), (central, True)):
+        parts = distributed.computes_with(config, setup, central=is_central)
+        assert parts == ("numpy", *wanted)
+        found = distributed.computed(parts)
+        distributed.refuse_other_arithmetic(0, found)
+        for part in parts:
+            with pytest.raises(SpaceDistError, match=rf"computes other bits than this process with {part} \(0 there"):
+                distributed.refuse_other_arithmetic(0, {**found, part: "0"})
+    monkeypatch.setattr(distributed, "scipy_probes", lambda: iter([("qr", np.zeros(1))]))
+    assert distributed.computed(["scipy"]) != {"scipy": digest(scipy_probes())}
