@@ -1,7 +1,7 @@
 """Layouts of 5x5 mazes: carving them, reading them, and the shortest way through.
 
 A layout is 25 numbers, cell by cell in reading order (x runs fastest, (0, 0) is the top left). A cell's number is the
-sum of the bits of its open sides: north 1, east 2, south 4, west 8. Facts: ../shared/reference/algorithm.md ("Maze").
+sum of the bits of its open sides: north 1, east 2, south 4, west 8. Facts: docs/environments.md ("Maze").
 """
 
 from __future__ import annotations

@@ -101,3 +101,46 @@ def test_what_is_replaced_still_has_derivatives_and_takes_every_kind() -> None:
     assert torch.sqrt(torch.tensor(4.0)).shape == ()
     assert torch.sqrt(torch.tensor([4.0], dtype=torch.bfloat16)).dtype == torch.bfloat16
     assert torch.isnan(torch.sqrt(torch.tensor(-1.0)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.int64])
+@pytest.mark.parametrize("shape", [(3, 4, 5, 6), (1, 1, 5, 7), (2, 33, 17, 1)])
+def test_products_of_stacks_are_what_they_should_be(shape: tuple[int, int, int, int], dtype: torch.dtype) -> None:
+    """In each way that they can be asked for, against sums in double precision; transposed operands among them."""
+    count, rows, inner, columns = shape
+    generator = torch.Generator().manual_seed(0)
+    left = torch.randn(count, rows, inner, generator=generator).mul(3).to(dtype)
+    right = torch.randn(count, columns, inner, generator=generator).mul(3).to(dtype).transpose(1, 2)
+    added = torch.randn(count, 1, columns, generator=generator).mul(3).to(dtype)
+    exact = (left.double()[:, :, :, None] * right.double()[:, None]).sum(dim=2)
+    within = {"rtol": 0.02, "atol": 0.2} if dtype == torch.bfloat16 else {"rtol": 1e-5, "atol": 1e-5}
+
+    def same(found: torch.Tensor, expected: torch.Tensor) -> None:
+        assert found.dtype == dtype
+        torch.testing.assert_close(found.double(), expected, **within)
+
+    into, turned = torch.empty(0, dtype=dtype), torch.empty(count, columns, rows, dtype=dtype).transpose(1, 2)
+    same(torch.bmm(left, right), exact)
+    same(torch.bmm(left, right, out=into), exact)
+    same(into, exact)
+    same(torch.bmm(left, right, out=turned), exact)
+    same(torch.baddbmm(added, left, right), added.double() + exact)
+    same(torch.baddbmm(added, left, right, beta=2, alpha=3), 2 * added.double() + 3 * exact)
+    same(torch.baddbmm(added, left, right, out=into), added.double() + exact)
+    same(torch.baddbmm(into, left, right, out=into), added.double() + 2 * exact)
+    same(into.baddbmm_(left, right), added.double() + 3 * exact)
+    if dtype.is_floating_point:
+        same(torch.baddbmm(torch.full_like(added, float("nan")), left, right, beta=0), exact)
+    with pytest.raises(RuntimeError, match="have no products"):
+        torch.bmm(left, right[:, :-1])
+
+
+def test_products_of_stacks_have_derivatives_and_no_companions() -> None:
+    generator = torch.Generator().manual_seed(0)
+    left, right = torch.randn(4, 16, 33, generator=generator), torch.randn(4, 33, 7, generator=generator)
+    added = torch.randn(4, 1, 7, generator=generator)
+    inputs = [one.double().requires_grad_() for one in (added, left, right)]
+    assert torch.autograd.gradcheck(lambda *of: torch.baddbmm(*of) + torch.bmm(*of[1:]), inputs)
+    for member in range(4):
+        one = slice(member, member + 1)
+        assert torch.equal(torch.baddbmm(added, left, right)[one], torch.baddbmm(added[one], left[one], right[one]))

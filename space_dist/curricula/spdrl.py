@@ -6,7 +6,7 @@ an iteration, maximise
     mean_j [ p(c_j) / p_old(c_j) * V(s0, c_j) ] - alpha * KL(p || target)    subject to    KL(p_old || p) <= epsilon
 
 over the iteration's contexts c_j. Its contexts are generated, so they are of no instance set; evaluation stays on the
-instance sets of everyone. ../shared/reference/algorithm.md ("SPDRL") names what the published code does.
+instance sets of everyone. docs/curricula.md ("SPDRL") names what the published code does.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """AntGoal (Eimer et al. 2021): PyBullet's Ant walks towards a goal, and one of its legs may be disabled.
 
-Facts: ../shared/reference/algorithm.md ("AntGoal"). Robot: `mjcf/ant.xml` of `pybullet_data`. Physics, observation
+Facts: docs/environments.md ("AntGoal"). Robot: `mjcf/ant.xml` of `pybullet_data`. Physics, observation
 and reward are those of PyBullet Gym's AntBulletEnv (https://github.com/bulletphysics/bullet3, `pybullet_envs`; kept
 alive in https://github.com/araffin/pybullet_envs_gymnasium), against which `tests/test_antgoal.py` compares every step.
 """

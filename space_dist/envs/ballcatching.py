@@ -1,6 +1,6 @@
 """BallCatching (Klink et al. 2020): an arm that moves in a plane catches balls thrown at it with a net.
 
-Facts: ../shared/reference/algorithm.md ("BallCatching"); Klink et al., "Self-Paced Deep Reinforcement Learning", 2020.
+Facts: docs/environments.md ("BallCatching"); Klink et al., "Self-Paced Deep Reinforcement Learning", 2020.
 Theirs is a Barrett WAM in MuJoCo. Ours is the 7-joint KUKA iiwa of `pybullet_data`, so returns are not comparable:
 what comes from them is marked "Klink", what had to be chosen for this arm "ours".
 """

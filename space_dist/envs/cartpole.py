@@ -1,7 +1,7 @@
 """CartPole (Barto et al. 1983; Gymnasium's CartPole-v1) whose pole's length is the context and changes the dynamics.
 
 The physics are those of `gymnasium/envs/classic_control/cartpole.py`. Facts about the paper's three poles:
-../shared/reference/algorithm.md ("CartPole").
+docs/environments.md ("CartPole").
 """
 
 from __future__ import annotations

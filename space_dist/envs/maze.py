@@ -1,6 +1,6 @@
 """Maze (gym-maze, 5x5): find the way from the top left to the bottom right; the layout is the context.
 
-Facts: ../shared/reference/algorithm.md ("Maze 5x5").
+Facts: docs/environments.md ("Maze").
 """
 
 from __future__ import annotations

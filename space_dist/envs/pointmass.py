@@ -1,6 +1,6 @@
 """PointMass (Klink et al. 2020): steer a point through a gate in a wall to a goal behind it.
 
-Facts: ../shared/reference/algorithm.md ("PointMass"); Klink et al., "Self-Paced Deep Reinforcement Learning", 2020.
+Facts: docs/environments.md ("PointMass"); Klink et al., "Self-Paced Deep Reinforcement Learning", 2020.
 """
 
 from __future__ import annotations
