@@ -924,8 +924,8 @@ def identity(
 def differences(one: RunConfig, other: RunConfig) -> list[str]:
     """`key: value -> value` for every key that decides results and differs; instance paths are left out."""
     exclude = {*NOT_IDENTITY, "instances"}
-    left = dict(_flatten(one.model_dump(mode="json", exclude=exclude)))
-    right = dict(_flatten(other.model_dump(mode="json", exclude=exclude)))
+    left = dict(flattened(one.model_dump(mode="json", exclude=exclude)))
+    right = dict(flattened(other.model_dump(mode="json", exclude=exclude)))
     return [f"{key}: {left.get(key)} -> {right.get(key)}" for key in sorted({*left, *right})
             if left.get(key) != right.get(key)]  # fmt: skip
 
@@ -935,10 +935,11 @@ def schema() -> Iterator[tuple[str, str, str, str]]:
     yield from _describe(RunConfig, "")
 
 
-def _flatten(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flattened(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(`section.key`, value) of everything in nested settings; of an empty section nothing."""
     for key, value in data.items():
         if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{key}.")
+            yield from flattened(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 

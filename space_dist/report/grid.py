@@ -11,14 +11,14 @@ import functools
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from space_dist.config import clean
+from space_dist.config import clean, flattened
 from space_dist.errors import LedgerError
 from space_dist.manifest import Cell, Grid, Manifest
 from space_dist.report.figures import HeatMap
@@ -66,7 +66,7 @@ class CellRuns:
     @functools.cached_property
     def settings(self) -> dict[str, Any]:
         """Its place on the grid's axes, sections taken apart: `curriculum.kind`, `curriculum.eta`, ..."""
-        return dict(_flattened(self.cell.settings))
+        return dict(flattened(self.cell.settings))
 
     def times(self, threshold: float) -> dict[int, float]:
         """Per finished seed, the step at which it reached the threshold; NaN if it did not within the budget."""
@@ -209,14 +209,6 @@ def _untestable(cell: CellRuns, threshold: float) -> str:
 
 
 # ---- settings -------------------------------------------------------------------------------------------------------
-
-
-def _flattened(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flattened(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _is_of_task(key: str) -> bool:

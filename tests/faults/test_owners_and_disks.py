@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,9 +39,10 @@ def on_host(name: str, *flags: str) -> list[str]:
 @pytest.mark.parametrize("flags", [(), ("--pid", "--fork", "--kill-child")], ids=["hosts", "two containers"])
 def test_of_two_processes_on_two_hosts_one_works_and_the_other_says_why(tmp_path: Path, flags: tuple[str, ...]) -> None:
     train = command(tmp_path, env="tests.faults.slow_env:make")
+    words = [sys.executable, "-m", "space_dist.cli", *map(str, train)]
     both = [
         subprocess.Popen(
-            [*on_host(f"node{number}", *flags), *train], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [*on_host(f"node{number}", *flags), *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, env={**os.environ, PAUSE: "0.02"},
         )
         for number in (1, 2)
@@ -56,9 +58,9 @@ def test_of_two_processes_on_two_hosts_one_works_and_the_other_says_why(tmp_path
     assert Ledger(tmp_path / "run").status().state == "done"
 
 
-def ended(train: list[str], output: Path) -> tuple[int | None, str]:
-    """Exit code of a `python -m space_dist.cli ...` that is forked instead, and what it said."""
-    process = prepared.command(list(train[3:]), output)
+def ended(train: list[object], output: Path) -> tuple[int | None, str]:
+    """Exit code of `space-dist ...`, and what it said."""
+    process = prepared.command(train, output)
     process.join(PATIENCE)
     return process.exitcode, output.read_text()
 

@@ -22,7 +22,7 @@ _SHORT = [
     "budget.steps=384", "rollout.shards=2", "rollout.slots=4", "learner.n_steps=128", "env.kwargs.horizon=12",
     "evaluation.every_steps=100000", "tracking.uri=null", "resources.workers=0",
 ]  # fmt: skip
-_PPO = [*_SHORT, "learner.n_epochs=2"]
+_PPO = [*_SHORT, "learner.n_epochs=2", "learner.net_arch=[32, 32]"]
 _SMALL = [*_PPO, "learner.net_arch=[16, 16]"]
 _LEAN = [*_SMALL, "learner.update=lean"]
 _BULLET = ["budget.steps=96", "learner.n_steps=48", "learner.batch_size=24", "rollout.slots=1"]  # a world a slot
@@ -47,7 +47,9 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "ppo lean": ("pointmass_space", [
         *_LEAN, "learner.net_arch=[40, 24]", "learner.ent_coef=0.01", "learner.target_kl=0.02",
     ]),
-    "ppo population": ("pointmass_space", [*_PPO, "engine=population", "curriculum.eta=4"]),
+    "ppo population": ("pointmass_space", [
+        *_PPO, "engine=population", "curriculum.eta=4", "learner.net_arch=[48]",
+    ]),
     "ppo shared curriculum": ("pointmass_space", [
         *_PPO, "engine=population", "curriculum.aggregate=population", "curriculum.policies=2", "budget.steps=768",
         "learner.net_arch=[16, 16]",
