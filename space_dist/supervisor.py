@@ -474,10 +474,8 @@ def main() -> None:
 
 def preload() -> None:
     """Import what every run needs, so that forks need not. Starts no thread."""
+    import space_dist.learner
     import space_dist.population  # noqa: F401
-    from space_dist import learner
-
-    learner.preload()
 
 
 if __name__ == "__main__":

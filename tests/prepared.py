@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["space_dist.cli.runs", "space_dist.launch", "torch._dynamo"])
+_CONTEXT.set_forkserver_preload(["space_dist.cli.runs", "space_dist.launch", "stable_baselines3"])
 _ROOT = Path(__file__).resolve().parent.parent
 
 

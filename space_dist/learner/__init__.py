@@ -36,6 +36,9 @@ from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearn
 from space_dist.learner.on_policy import OnPolicyLearner
 from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
 from space_dist.learner.population import refuse as refuse_population
+from space_dist.learner.uncompiled import stand_in
+
+stand_in()  # before the first optimiser
 
 
 def make_learner(
@@ -85,12 +88,6 @@ def refuse_machine(config: RunConfig) -> None:
         )
 
 
-def preload() -> None:
-    """Have torch load what it loads with the first optimiser: a second that forked runs need not spend each."""
-    torch.set_num_threads(1)
-    torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
-
-
 def make_ensemble(config: RunConfig, observation_space: spaces.Space[Any], features: Sequence[str]) -> Ensemble | None:
     """The ensemble of value functions that a config's curriculum asks for, if it does.
 
@@ -119,7 +116,6 @@ __all__ = [
     "make_ensemble",
     "make_learner",
     "member_bytes",
-    "preload",
     "refuse_machine",
     "refuse_population",
     "refuse_spaces",
