@@ -219,7 +219,6 @@ class _Measured(Exception):  # noqa: N818 - no error
 def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     """Runs side by side in this process, marked where the last of them has collected."""
     from space_dist.interrupts import StopRequests
-    from space_dist.learner import preload
     from space_dist.population import advance, member
     from space_dist.training import Learn
 
@@ -234,7 +233,6 @@ def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     def ended(path: Path, outcome: object) -> None:
         raise RuntimeError(f"{path} ended before it was measured: {outcome}")
 
-    preload()
     with tempfile.TemporaryDirectory() as folder:
         stop, works = StopRequests(), dict[Path, Any]()
         for seed in range(contender.members):
