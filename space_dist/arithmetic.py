@@ -39,6 +39,10 @@ SETTINGS = {
 REFERENCE = {"numpy": "e630e599df894ccc", "all": "9a84082eb5e4898d"}
 """`digest` of NumPy's part, and of everything, on x86-64 with AVX2 and FMA, with the versions of constraints.txt."""
 
+CHOICE = "SPACE_DIST_ARITHMETIC"
+"""What a process computes with, in its environment: `one` (or nothing), or `native`, the libraries' own choice by CPU,
+for runs whose config says so. It is read before libraries are loaded, when no config is known yet."""
+
 _DIGITS = 16
 _NEEDED = {"avx2", "fma"}
 _overruled: dict[str, str] = {}
@@ -48,8 +52,14 @@ _late: list[str] = []
 def settle() -> None:
     """Make the settings for this process and its children; note what was overruled, and warn of what came too late.
 
-    Leaves another kind of CPU alone: there the libraries' own choice holds, and `digest` tells it apart.
+    Leaves another kind of CPU alone, and a process that is to be `native`: there the libraries' own choice holds, and
+    `digest` tells it apart.
     """
+    if chosen() == "native":
+        for name, ours in SETTINGS.items():
+            if os.environ.get(name) == ours:  # from a process of ours that is not
+                del os.environ[name]
+        return
     if not has_reference_cpu():
         return
     before = {name: os.environ.get(name) for name in SETTINGS}
@@ -66,6 +76,18 @@ def settle() -> None:
                 "results the same on every CPU: import space_dist first",
                 stacklevel=3,
             )
+
+
+def chosen() -> str:
+    """What the environment asks of this process: `one` or `native` (or what is neither, which no run begins with)."""
+    return os.environ.get(CHOICE) or "one"
+
+
+def settings() -> dict[str, str]:
+    """The variables with which a process elsewhere chooses as this one does."""
+    if chosen() == "native":
+        return {CHOICE: "native"}
+    return SETTINGS if has_reference_cpu() else {}
 
 
 def has_reference_cpu() -> bool:
@@ -90,6 +112,11 @@ def overruled() -> list[str]:
 
 def remarks(found: str) -> list[str]:
     """Sentences about this process's arithmetic, whose `digest` of everything is `found`: for the log of a run."""
+    if chosen() == "native":
+        return [
+            f"arithmetic: native: libraries choose their kernels by the CPU ({found}); results are valid, and "
+            "repeatable on CPUs of this kind, but are not the bits of other machines"
+        ]
     if found == REFERENCE["all"]:
         return overruled()
     if not has_reference_cpu():

@@ -752,6 +752,10 @@ class RunConfig(Section):
     device: Literal["cpu", "cuda"] = "cpu"
     """Where updates are computed; cuda: a GPU, with engine: population, where up to 1,024 runs share a process. A
     member's last bits depend on its companions there. Part of what a run is."""
+    arithmetic: Literal["one", "native"] = "one"
+    """Whose bits results have. one: the same on every x86-64 CPU with AVX2 and FMA. native: those of the kernels that
+    libraries choose by the CPU, in processes that have SPACE_DIST_ARITHMETIC=native in their environment. Part of what
+    a run is."""
     env: EnvConfig
     instances: InstancesConfig
     curriculum: CurriculumConfig

@@ -37,7 +37,8 @@ from ray.util.placement_group import PlacementGroup, placement_group, placement_
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import SETTINGS, digest, has_reference_cpu, numpy_digest, scipy_probes
+from space_dist.arithmetic import digest, numpy_digest, scipy_probes
+from space_dist.arithmetic import settings as arithmetic_settings
 from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
@@ -412,8 +413,8 @@ class RayCluster:
             # Never restarted by Ray: an actor that came back blank would go on silently.
             inside = PlacementGroupSchedulingStrategy(self._room, placement_group_bundle_index=-1)
             options: dict[str, Any] = {"max_restarts": 0, "scheduling_strategy": inside}
-            if self._resources.address != "local" and has_reference_cpu():  # our own Ray's processes inherit them
-                options["runtime_env"] = {"env_vars": SETTINGS}
+            if self._resources.address != "local" and (chosen := arithmetic_settings()):  # our own Ray's inherit them
+                options["runtime_env"] = {"env_vars": chosen}
             setup = self._setup_piece.ref
             self._actors[seat] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup)

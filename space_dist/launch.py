@@ -36,6 +36,7 @@ from space_dist.errors import (
     SpaceDistError,
     about,
     exits_refused,
+    nearest,
 )
 from space_dist.files import LogFile, appending, in_words
 from space_dist.importing import PYTHON
@@ -149,6 +150,7 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
     train, test = read_instances(config)
     setup = make_setup(config, train, test)
     refuse_machine(config)
+    _refuse_other_arithmetic(config)
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
@@ -170,6 +172,24 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
             course.heed()  # before Ray is started
             yield course
+
+
+def _refuse_other_arithmetic(config: RunConfig) -> None:
+    """Raise ConfigError where this process, which chose before it knew the config, computes with another arithmetic."""
+    here, known = arithmetic.chosen(), ("one", "native")
+    if here not in known:
+        raise ConfigError(f"{arithmetic.CHOICE}={here} of the environment is not known{nearest(here, known)} "
+                          "Allowed: one, native")  # fmt: skip
+    if config.arithmetic == "native" and here != "native":
+        raise ConfigError(
+            f"arithmetic: native is chosen before libraries are loaded: start with {arithmetic.CHOICE}=native in the "
+            "environment (of a grid: of all its nodes), or use arithmetic: one"
+        )
+    if config.arithmetic != here:
+        raise ConfigError(
+            f"{arithmetic.CHOICE}=native of the environment, and arithmetic: one in the config: unset it, or use "
+            "--set arithmetic=native"
+        )
 
 
 def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:

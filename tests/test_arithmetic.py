@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from space_dist import arithmetic
+from space_dist import config as configs
 from space_dist.arithmetic import REFERENCE, SETTINGS, digest, numpy_digest, remarks, settle
+from space_dist.errors import ConfigError
+from space_dist.interrupts import StopRequests
+from space_dist.launch import launch
 from space_dist.learner import torch_probes
+from tests.patience import PATIENCE
+
+ROOT = Path(__file__).resolve().parent.parent
 
 pytestmark = pytest.mark.skipif(not arithmetic.has_reference_cpu(), reason="settings are for x86-64 with AVX2 and FMA")
 
@@ -144,3 +153,69 @@ def test_products_of_stacks_have_derivatives_and_no_companions() -> None:
     for member in range(4):
         one = slice(member, member + 1)
         assert torch.equal(torch.baddbmm(added, left, right)[one], torch.baddbmm(added[one], left[one], right[one]))
+
+
+RUN = """
+import sys
+sys.argv[1:] = ["train", "configs/pointmass_space.yaml", "--out", sys.argv[1], "--workers", "0", "--resume", "--set",
+                "tracking.uri=null", "--set", "learner.n_steps=112", "--set", "rollout.slots=4", *sys.argv[2:]]
+from space_dist.cli import main
+main()
+"""
+
+
+def train(folder: Path, *settings: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    words = [word for setting in settings for word in ("--set", setting)]
+    inherited = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    return subprocess.run(
+        [sys.executable, "-c", RUN, str(folder), *words], env=inherited | environment, capture_output=True, text=True,
+        cwd=ROOT, timeout=PATIENCE,
+    )  # fmt: skip
+
+
+def test_a_native_process_leaves_libraries_their_choice() -> None:
+    code = ("import space_dist, os, space_dist.learner.elementary as elementary; print(sorted(set(os.environ) & set("
+            "space_dist.arithmetic.SETTINGS)), os.environ.get('MKL_CBWR'), elementary._library)")  # fmt: skip
+    assert fresh(code, SPACE_DIST_ARITHMETIC="native").stdout == "[] None None\n"
+    assert fresh(code, SPACE_DIST_ARITHMETIC="native", **SETTINGS).stdout == "[] None None\n"  # a child of ours
+    assert fresh(code, SPACE_DIST_ARITHMETIC="native", MKL_CBWR="AVX2").stdout == "['MKL_CBWR'] AVX2 None\n"
+
+
+def test_a_native_run_says_so_and_is_another_run(tmp_path: Path) -> None:
+    budget = ("budget.steps=224", "arithmetic=native")
+    done = train(tmp_path / "run", *budget, SPACE_DIST_ARITHMETIC="native")
+    assert done.returncode == 0, done.stderr
+    assert "arithmetic: native: libraries choose their kernels by the CPU" in (tmp_path / "run/log.txt").read_text()
+    refused = train(tmp_path / "run", *budget)
+    assert refused.returncode == 2
+    assert "start with SPACE_DIST_ARITHMETIC=native in the environment" in " ".join(refused.stderr.split())
+    assert "Traceback" not in refused.stderr
+
+
+def test_a_choice_that_is_not_the_configs_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = [configs.load(ROOT / "configs/pointmass_space.yaml", [f"arithmetic={one}"]) for one in ("one", "native")]
+    one, native = made
+    assert configs.identity(one, "", "") != configs.identity(native, "", "")
+    for config, given, words in (
+        (native, None, "arithmetic: native is chosen before libraries are loaded"),
+        (native, "one", "or use arithmetic: one"),
+        (one, "native", "arithmetic: one in the config: unset it, or use --set arithmetic=native"),
+        (one, "natve", "SPACE_DIST_ARITHMETIC=natve of the environment is not known; did you mean 'native'? Allowed:"),
+    ):
+        if given is None:
+            monkeypatch.delenv(arithmetic.CHOICE, raising=False)
+        else:
+            monkeypatch.setenv(arithmetic.CHOICE, given)
+        with pytest.raises(ConfigError, match=re.escape(words)):
+            launch(config, tmp_path / "run", resume=False, stop=StopRequests())
+    assert not (tmp_path / "run").exists()
+
+
+def test_actors_elsewhere_choose_as_this_process_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(arithmetic.CHOICE, raising=False)
+    assert arithmetic.settings() == SETTINGS
+    monkeypatch.setenv(arithmetic.CHOICE, "native")
+    assert arithmetic.settings() == {arithmetic.CHOICE: "native"}
+    monkeypatch.delenv(arithmetic.CHOICE)
+    monkeypatch.setattr(arithmetic, "has_reference_cpu", lambda: False)
+    assert arithmetic.settings() == {}

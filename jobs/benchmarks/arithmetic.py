@@ -1,16 +1,18 @@
-"""What one arithmetic for all CPUs costs: training with its settings, and with what libraries choose by themselves."""
+"""What one arithmetic for all CPUs costs: training with it, and with `arithmetic: native`."""
 
 from __future__ import annotations
 
 import statistics
+from dataclasses import replace
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.contenders import NATIVE, Contender, specification
+from benchmarks.contenders import Contender, specification
 from benchmarks.throughput import process
+from space_dist.arithmetic import CHOICE
 
 MEMBERS = 16  # of a population
 TRPO = "learner={kind: trpo, n_steps: 2048, gamma: 0.95, target_kl: 0.004}"
@@ -20,8 +22,7 @@ WORKS = {
     "population, PPO": Contender("ours", update="population", members=MEMBERS),
     "population, TRPO": Contender("ours", update="population", members=MEMBERS, overrides=(TRPO,)),
 }
-# The libraries' own choice, before ours is made, and torch's own kernels instead of those that we give it.
-OWN = f"{NATIVE}; {{first}}; from space_dist.learner import elementary; elementary._library._destroy()"
+FIRST = {True: "", False: f"import os; os.environ[{CHOICE!r}] = 'native'; "}  # whether it is ours
 console = Console()
 
 
@@ -29,14 +30,16 @@ def arithmetic(
     rounds: Annotated[int, typer.Option(min=1, help="Interleaved rounds.")] = 5,
     seconds: Annotated[float, typer.Option(min=0.1, help="CPU time of one measurement, warm-up apart.")] = 3.0,
 ) -> None:
-    """Environment steps per CPU second, collecting and learning, with one arithmetic for all CPUs and without."""
+    """Environment steps per CPU second, collecting and learning, with one arithmetic for all CPUs and with `native`."""
     rates: dict[tuple[str, bool], list[float]] = {(work, ours): [] for work in WORKS for ours in (True, False)}
     for _ in range(rounds):
         for (work, ours), found in rates.items():
             contender = WORKS[work]
+            if not ours:
+                contender = replace(contender, overrides=(*contender.overrides, "arithmetic=native"))
             wanted = specification("pointmass", contender, seconds, cpu=True)
-            found.append(process(wanted, contender.first if ours else OWN.format(first=contender.first))["rate"])
-    table = Table("", "one arithmetic, steps/s", "libraries' own choice, steps/s", "ratio (least and most)")
+            found.append(process(wanted, FIRST[ours] + contender.first)["rate"])
+    table = Table("", "one arithmetic, steps/s", "native, steps/s", "ratio (least and most)")
     for work in WORKS:
         settled, native = rates[work, True], rates[work, False]
         ratios = [one / other for one, other in zip(settled, native, strict=True)]

@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from space_dist.arithmetic import chosen
+
 _REPLACED: dict[str, np.ufunc] = {
     "sqrt": np.sqrt, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "tan": np.tan,
 }  # fmt: skip
@@ -125,7 +127,7 @@ _PRODUCTS: dict[str, Callable[..., torch.Tensor]] = {
     "bmm": _bmm, "bmm.out": _bmm_into, "baddbmm": _baddbmm, "baddbmm_": _baddbmm_in_place, "baddbmm.out": _baddbmm_into,
 }  # fmt: skip
 
-_library = _replace()  # holds for as long as this is kept
+_library = _replace() if chosen() != "native" else None  # holds for as long as this is kept
 
 
 def torch_probes() -> Iterator[tuple[str, NDArray[Any]]]:
