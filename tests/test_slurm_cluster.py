@@ -133,7 +133,7 @@ def write_grid(folder: Path, name: str, *, seeds: tuple[int, ...], **more: objec
         "name": "base", "env": {"id": "tests.slurm.gated_env:make"},
         "instances": {"train": "train.csv", "test": "test.csv"}, "curriculum": {"kind": "space"},
         "learner": {"kind": "ppo", "n_steps": 512, "n_epochs": 1, "net_arch": [16]},
-        "rollout": {"shards": 1, "slots": 1}, "budget": {"steps": 8192}, "evaluation": {"every_steps": 4096},
+        "rollout": {"shards": 1, "slots": 1}, "budget": {"steps": 16_384}, "evaluation": {"every_steps": 8192},
         "checkpoint": {"every_rounds": 1},
     }))  # fmt: skip
     (folder / f"{name}.yaml").write_text(to_yaml({
