@@ -28,6 +28,12 @@ import torch._dynamo as compiler
 print(compiler.__file__.endswith("__init__.py"), "sympy" in sys.modules)
 optimizer.step()
 """
+DISABLES = """
+import torch._dynamo
+asked = [torch.compiler.disable(lambda: 1), torch.compiler.disable()(lambda: 2),
+         torch.compiler.disable(recursive=False)(lambda: 3)]
+print([function() for function in asked], "sympy" in sys.modules)
+"""
 
 
 def said(program: str) -> list[str]:
@@ -38,4 +44,5 @@ def said(program: str) -> list[str]:
 
 def test_an_optimiser_imports_no_compiler_and_who_compiles_has_it() -> None:
     trained = "[0.5, 0.5, 0.5] False"
+    assert said(TRAINS + DISABLES) == [trained, "[1, 2, 3] True"]
     assert said(TRAINS + COMPILES) == [trained, "[3.0, 3.0]", "True True"]

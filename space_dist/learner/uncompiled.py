@@ -19,9 +19,10 @@ NAME = "torch._dynamo"
 class _Uncompiled(ModuleType):
     """`torch._dynamo` as optimisers see it while nothing is compiled."""
 
-    @staticmethod
-    def disable(function: Callable[..., Any], *_: Any, **__: Any) -> Callable[..., Any]:
-        return function
+    def disable(self, fn: Callable[..., Any] | None = None, *rest: Any, **named: Any) -> Any:
+        if fn is not None and named == {"wrapping": False}:  # as `torch/_compile.py` asks for parts of torch
+            return fn
+        return self._real().disable(fn, *rest, **named)
 
     @staticmethod
     def graph_break(*_: Any, **__: Any) -> None:
@@ -30,9 +31,12 @@ class _Uncompiled(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") and name != "__path__":  # whoever looks through all modules; not an import of a part
             raise AttributeError(name)
+        return getattr(self._real(), name)
+
+    def _real(self) -> Any:
         if sys.modules.get(NAME) is self:
             del sys.modules[NAME]
-        return getattr(importlib.import_module(NAME), name)
+        return importlib.import_module(NAME)
 
 
 def stand_in() -> None:
