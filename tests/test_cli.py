@@ -113,12 +113,10 @@ def test_a_mistake_is_one_clear_sentence_and_exit_code_2(
 
 
 @pytest.mark.parametrize("setting", ["learner.update=lean", "engine=population"])
-def test_numba_that_may_not_compile_is_told_before_anything_begins(
-    setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # which Numba reads when it is imported
+def test_numba_that_may_not_compile_is_told_before_anything_begins(setting: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "space_dist.cli", *map(str, train(setting, out=tmp_path / "run"))]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    variables = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE, env=variables)
     assert done.returncode == 2, done.stderr
     (line,) = done.stderr.splitlines()
     for part in ("NUMBA_DISABLE_JIT is set", setting.replace("=", ": "), "unset it, or use learner.update: stock"):
