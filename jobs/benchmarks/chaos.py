@@ -64,7 +64,6 @@ _FIRST, _LAST = 0.03, 0.9  # of all steps: when the first and the last fault may
 _MOST_DELAY, _MOST_PAUSE = 2.0, 3.0  # seconds: after the step count that calls for a fault; before a restart
 _FURTHER_ROUNDS = 2  # that a run must commit after a fault: the first may have been computed when it fell
 _SEARCH_SECONDS = 240.0  # for a target
-_FALL_SECONDS = 30.0  # for a signal to act, on a machine with much else to do
 _RECOVERY_SECONDS = 240.0
 _LEFT_SECONDS = 45.0  # for what was told to end
 _MARK = "SPACE_DIST_CHAOS"  # in the environment of every process that belongs to one rehearsal
@@ -461,7 +460,7 @@ class _Rehearsal:
             victim.send_signal(signal.SIGSTOP if verb == "stop" else signal.SIGKILL)
         if name in ("conductor", "submitter", "Ray head"):
             self._expected += 1
-        fell = until(lambda: all(_is_hit(victim, verb) for victim in victims), _FALL_SECONDS, 0.02)
+        fell = until(lambda: all(_is_hit(victim, verb) for victim in victims), 5.0, 0.02)
         counts = fell and any(
             (status := self._status(one.run)) is not None and status.state == "running"
             for one in (live if name in OF_ALL else [chosen])

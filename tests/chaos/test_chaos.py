@@ -1,4 +1,4 @@
-"""A short rehearsal of `jobs/benchmark.py chaos`: one fault of each of four kinds over a small grid."""
+"""A short rehearsal of `jobs/benchmark.py chaos`: one fault of each of five kinds over a small grid."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.chaos import KINDS, plan, rehearse
 
-# Stopped actors: tests/faults/test_parts.py; killed populations: tests/test_grid.py.
-BOUNDED = ("kill rollout actor", "kill driver", "kill Ray head", "kill tracking server")
+BOUNDED = ("kill rollout actor", "stop curriculum actor", "kill driver", "kill Ray head", "kill tracking server")
 
 
 def test_the_plan_is_seeded_and_even() -> None:
@@ -30,9 +29,15 @@ def test_the_plan_is_seeded_and_even() -> None:
     assert 0 < moments[0] < moments[-1] < 1000
 
 
+POPULATIONS = ("kill driver",)
+
+
 @pytest.mark.ray
 @pytest.mark.server
-def test_a_grid_under_faults_is_the_grid_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("engine", "kinds"), [("single", BOUNDED), ("population", POPULATIONS)])
+def test_a_grid_under_faults_is_the_grid_left_alone(
+    engine: str, kinds: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
     """Runs whose environment sleeps until the last fault has fallen: the machine is left to what recovers."""
     base, gate, said = tmp_path / "run.yaml", tmp_path / "gate", list[str]()
     base.write_text(configs.to_yaml({
@@ -44,12 +49,12 @@ def test_a_grid_under_faults_is_the_grid_left_alone(tmp_path: Path, monkeypatch:
     gate.touch()
     monkeypatch.setenv(GATE, str(gate))
     result = rehearse(
-        runs=3, steps=7680, seed=1, kinds=BOUNDED, count=len(BOUNDED), say=said.append, base=base, last=0.4,
-        settings={**instances, "learner.n_steps": 256, "evaluation.every_steps": 2560},
+        runs=3, steps=7680, seed=1, kinds=kinds, count=len(kinds), say=said.append, base=base, last=0.4,
+        settings={**instances, "engine": engine, "learner.n_steps": 256, "evaluation.every_steps": 2560},
         after_faults=gate.unlink,
     )  # fmt: skip
     assert not result.faults, "\n".join([*result.faults, *said])
-    assert sorted(hit.fault.kind for hit in result.hits) == sorted(BOUNDED)
+    assert sorted(hit.fault.kind for hit in result.hits) == sorted(kinds)
     assert all(hit.seconds is not None for hit in result.hits)
     assert result.identical == 3
-    assert result.submissions >= 2
+    assert result.submissions >= (2 if "kill Ray head" in kinds else 1)
