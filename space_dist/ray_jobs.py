@@ -36,6 +36,7 @@ from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
 from space_dist.standing import Attempts, Cause, Ended, Standing, concluded
 from space_dist.supervisor import Turn, ray_answers
+from space_dist.warm import cores, slurms_memory_of_a_core
 
 log = logging.getLogger("space_dist")
 
@@ -91,7 +92,7 @@ def _joined(
             raise Interrupted(f"stopped before Ray was started ({reason})")
 
     # A run with rollout actors may have more processes than this machine has cores; they share them.
-    context = join_ray(address, max(_cores(), (max_parallel or 1) * manifest.cpus_per_run), heed)
+    context = join_ray(address, max(cores(), (max_parallel or 1) * manifest.cpus_per_run), heed)
 
     def leave() -> None:
         if ray_answers(context["gcs_address"]):
@@ -101,12 +102,6 @@ def _joined(
     # Of a joined Ray that is gone, the conductor tells; from one of our own, Ray itself would end this process first.
     with attended(context, address, gone=address == "local", leave=leave):
         yield context.get("webui_url") or ""
-
-
-def _cores() -> int:
-    """CPUs that are ours: SLURM may give us fewer than it lets us see."""
-    cores, given = len(os.sched_getaffinity(0)), os.environ.get("SLURM_CPUS_PER_TASK", "")
-    return min(cores, int(given)) if given.isdecimal() and int(given) else cores
 
 
 def _await_nodes(count: int, stop_requested: Callable[[], str | None]) -> None:
@@ -137,10 +132,8 @@ def _memory_of_a_place(manifest: Manifest, address: str) -> float:
     """Of the CPUs that a run takes, in MB, on the node that has least of it for each CPU; infinite if none says."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
     shares = [node.get("memory", math.inf) / node["CPU"] / 2**20 for node in nodes if node.get("CPU")]
-    if address == "local" and (given := os.environ.get("SLURM_MEM_PER_CPU", "")).isdecimal():
-        shares.append(float(given))  # SLURM may give us less than it lets us see
-    if address == "local" and (given := os.environ.get("SLURM_MEM_PER_NODE", "")).isdecimal():
-        shares.append(float(given) / _cores())
+    if address == "local":
+        shares += slurms_memory_of_a_core()
     return min(shares, default=math.inf) * manifest.cpus_per_run
 
 

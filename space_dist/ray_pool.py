@@ -7,12 +7,10 @@ A worker that dies, or gives no sign of life, is replaced; what it was doing end
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import logging
 import os
 import secrets
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,16 +22,15 @@ from space_dist.place import RAY_DEFAULTS
 
 os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
-import psutil
 import ray
 from ray.exceptions import RayActorError, RayError
 
 from space_dist.errors import LedgerError, SpaceDistError
-from space_dist.importing import PYTHON
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import Attempts, Cause, Ended, concluded
-from space_dist.supervisor import STOPPED_SECONDS, Task, Turn, ray_answers
+from space_dist.standing import Cause, Ended
+from space_dist.supervisor import Task, Turn, ray_answers
+from space_dist.warm import SupervisorLostError, WarmSupervisor, all_lost, understood, unless_all_end
 
 log = logging.getLogger("space_dist")
 
@@ -49,59 +46,23 @@ class PoolWorker:
 
     def __init__(self, folder: str, nonce: str) -> None:
         refuse_other_folder(Path(folder), nonce)
-        self._folder = folder
-        self._process: subprocess.Popen[bytes] | None = None
-        self._stopped_since: float | None = None
+        self._supervisor = WarmSupervisor(Path(folder))
 
-    def _start(self) -> subprocess.Popen[bytes]:
-        command = [*PYTHON, "-m", "space_dist.supervisor"]
-        # Nothing of this actor's own identity: runs that join Ray join it as drivers.
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
-        with (Path(self._folder) / "pool.log").open("ab") as errors:
-            process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
-            )  # fmt: skip
-        self._read(process)
-        return process
-
-    def _read(self, process: subprocess.Popen[bytes]) -> dict[str, Any] | None:
-        """The next line of the supervisor's, None once it is gone."""
-        line = process.stdout.readline() if process.stdout is not None else b""
-        if not line:
+    def attempt(self, task: Task) -> list[dict[str, Any]] | None:
+        """How the attempts of a task ended; None if the supervisor was lost with them."""
+        self._supervisor.begin(task)
+        try:
+            return self._supervisor.ended()
+        except SupervisorLostError:
             return None
-        message: dict[str, Any] = json.loads(line)
-        return message
-
-    def attempt(self, task: dict[str, Any]) -> dict[str, Any] | None:
-        """How the attempt ended; None if the supervisor was lost with it."""
-        if self._process is None or self._process.poll() is not None:
-            self._process = self._start()
-        self._send(task)
-        message = self._read(self._process)
-        if message is None:
-            self._process.wait()
-            self._process = None
-        return message
-
-    def _send(self, message: dict[str, Any]) -> None:
-        if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.write(json.dumps(message).encode() + b"\n")
-                self._process.stdin.flush()
 
     def stop(self, cause: str) -> None:
         """Ask the live attempt to checkpoint and end."""
-        self._send({"stop": cause})
+        self._supervisor.stop(cause)
 
     def sign(self) -> str:
         """A sign of life: the id of the node. Kills a supervisor that somebody has stopped (SIGSTOP) for too long."""
-        process = self._process
-        if process is not None:
-            with contextlib.suppress(psutil.Error):
-                stopped = psutil.Process(process.pid).status() == psutil.STATUS_STOPPED
-                self._stopped_since = (self._stopped_since or time.monotonic()) if stopped else None
-                if self._stopped_since is not None and time.monotonic() - self._stopped_since > STOPPED_SECONDS:
-                    process.kill()
+        self._supervisor.kill_if_stopped()
         node: str = ray.get_runtime_context().get_node_id()
         return node
 
@@ -166,7 +127,7 @@ class Pool:
         each = tuple(Turn(run.cell.id, run.seed, attempt) for run, attempt in turns)
         task = Task(str(self._grid.folder), each, self._address)
         slot.turns, slot.heard = turns, time.monotonic()
-        slot.answer = slot.actor.attempt.remote(dataclasses.asdict(task))
+        slot.answer = slot.actor.attempt.remote(task)
 
     def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a pool does not outlive its conductor
         """See `grid.Executor`."""
@@ -185,9 +146,9 @@ class Pool:
             turns = slot.turns
             try:
                 if turns and ray.wait([slot.answer], timeout=0)[0]:
-                    message = ray.get(slot.answer)
+                    ends = ray.get(slot.answer)
                     slot.turns, slot.answer = (), None
-                    ended += self._understood(turns, message)
+                    ended += understood(turns, ends) if ends is not None else self._killed(turns)
                 else:
                     self._listen(slot)
             except RayActorError as error:
@@ -200,32 +161,11 @@ class Pool:
                 log.warning("lost a worker of the pool: %s", str(error).splitlines()[0][:200])
                 lost = self._lost(slot)
                 self._slots[index] = self._hire()
-                ended += self._all_lost(turns, lost)
+                ended += all_lost(self._grid, turns, lost)
         if all(slot.node is None and time.monotonic() - slot.hired > _START_SECONDS for slot in self._slots):
             raise SpaceDistError(
                 f"Ray did not start a worker of one CPU within {_START_SECONDS:.0f} s; {_cpus()} CPUs are free"
             )
-        return ended
-
-    def _understood(
-        self, turns: Sequence[tuple[Run, int]], message: dict[str, Any] | None
-    ) -> list[tuple[Run, Ended | None]]:  # fmt: skip
-        if message is None:
-            return self._all_lost(turns, self._unless_all_end(Ended(Cause.KILLED, "its supervisor was killed")))
-        return [
-            (run, None if end["busy"] else Ended(None if end["cause"] is None else Cause(end["cause"]), end["detail"]))
-            for (run, _), end in zip(turns, message["ends"], strict=True)
-        ]
-
-    def _all_lost(self, turns: Sequence[tuple[Run, int]], lost: Ended) -> list[tuple[Run, Ended | None]]:
-        """Those that are done are done; nobody but us can say how the others ended."""
-        ended: list[tuple[Run, Ended | None]] = []
-        for run, attempt in turns:
-            ledger = self._grid.ledger(run)
-            if (how := concluded(ledger, attempt)) is None:
-                how = lost
-                Attempts(ledger).end(attempt, lost)
-            ended.append((run, how))
         return ended
 
     def _listen(self, slot: _Slot) -> None:
@@ -244,12 +184,11 @@ class Pool:
         alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         if slot.node is not None and slot.node not in alive:
             return Ended(Cause.NODE_LOST, "the node of its worker is gone")
-        return self._unless_all_end(Ended(Cause.KILLED, "its worker was killed"))
+        return unless_all_end(Ended(Cause.KILLED, "its worker was killed"), self._stop_requested())
 
-    def _unless_all_end(self, ended: Ended) -> Ended:
-        """A batch system that ends a job signals all its processes, and so us, too: that is nobody's failure."""
-        reason = self._stop_requested()
-        return ended if reason is None else Ended(Cause.PREEMPTED, f"all processes were asked to end ({reason})")
+    def _killed(self, turns: Sequence[tuple[Run, int]]) -> list[tuple[Run, Ended | None]]:
+        lost = unless_all_end(Ended(Cause.KILLED, "its supervisor was killed"), self._stop_requested())
+        return all_lost(self._grid, turns, lost)
 
     def _hire(self) -> _Slot:
         # Never restarted by Ray: who hires knows what it was doing.

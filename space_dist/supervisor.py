@@ -46,7 +46,7 @@ OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
 _LOOK_SECONDS = 0.1
 _SIGN_SECONDS = 5.0
-_KILL_SECONDS = 10.0  # after a run's grace time
+KILL_SECONDS = 10.0  # after a run's grace time
 _LISTEN_SECONDS = 2.0
 _PDEATHSIG = 1  # prctl's
 _MOST_WORDS = 4000  # of an error
@@ -295,7 +295,7 @@ class _Watch:
 
     def _ask(self, reason: Ended) -> None:
         self.reason = reason
-        self.kill_at = time.monotonic() + self.resources.grace_seconds + _KILL_SECONDS
+        self.kill_at = time.monotonic() + self.resources.grace_seconds + KILL_SECONDS
         self.child.signal(signal.SIGTERM)
 
     def _end(self, reason: Ended) -> None:

@@ -44,6 +44,7 @@ from space_dist.ledger import (
     encode_row,
     find_ledgers,
 )
+from tests.faults.injection import Disk, Kills
 from tests.patience import PATIENCE
 
 quick = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -639,60 +640,6 @@ def in_a_fork(action: Callable[[], object]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-class Mortal:
-    """Counts every call that changes the disk, and ends the process before the `last`-th, in the middle of writes."""
-
-    def __init__(self, last: int) -> None:
-        self.last, self.calls = last, 0
-
-    def tick(self) -> None:
-        self.calls += 1
-        if self.calls == self.last:
-            os._exit(9)
-
-    def wrapped(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            self.tick()
-            return function(*args, **kwargs)
-
-        return call
-
-    def install(self) -> None:
-        """For good: only ever in a process of its own."""
-        for name in ("replace", "unlink", "mkdir", "open"):
-            setattr(os, name, self.wrapped(getattr(os, name)))
-        os.fsync = self.wrapped(lambda descriptor: None)  # a killed process loses nothing that it handed over
-        open_path, fdopen = Path.open, os.fdopen
-        Path.open = lambda path, mode="r", *rest, **named: (  # type: ignore[method-assign, assignment]
-            open_path(path, mode, *rest, **named) if mode in ("r", "rb") else MortalFile(open_path(path, mode), self)
-        )
-        os.fdopen = lambda *args: MortalFile(fdopen(*args), self)  # type: ignore[assignment]
-
-
-class MortalFile:
-    def __init__(self, file: Any, mortal: Mortal) -> None:
-        self._file, self._mortal = file, mortal
-
-    def write(self, content: bytes) -> None:
-        for part in (content[: len(content) // 2], content[len(content) // 2 :]):
-            self._mortal.tick()
-            self._file.write(part)
-            self._file.flush()
-
-    def truncate(self, *size: int) -> None:
-        self._mortal.tick()
-        self._file.truncate(*size)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-    def __enter__(self) -> MortalFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-
 def whole_run(folder: Path, last: int = 4) -> None:
     with RunWriter(Ledger(folder)) as writer:
         writer.write_config("name: x\n", "train\n", "test\n")
@@ -706,65 +653,46 @@ def whole_run(folder: Path, last: int = 4) -> None:
 
 def test_a_run_killed_before_any_call_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # for speed
-    whole_run(tmp_path / "reference")
-    reference = contents(tmp_path / "reference")
-    reached = set()
-    for last in range(1, 1_000):
-        folder = tmp_path / str(last)
-        mortal = Mortal(last)
-
-        def doomed(folder: Path = folder, mortal: Mortal = mortal) -> None:
-            mortal.install()
-            whole_run(folder)
-
-        code = in_a_fork(doomed)
-        assert code in (0, 9)
+    run = tmp_path / "run"
+    run.mkdir()
+    kills = Kills(run, tmp_path / "killed", uncompared=())
+    with Disk(run, kills).watched() as disk:
+        whole_run(run)
+    reference, reached = contents(run), set()
+    for what, folder in kills.moments:
         ledger = Ledger(folder)
         said = 0
         if ledger.status_file.exists():
             status = ledger.status()
             said = status.round
-            assert (ledger.config.read_bytes(), status.name) == (b"name: x\n", "name")
+            assert (ledger.config.read_bytes(), status.name) == (b"name: x\n", "name"), what
             if status.state == "done":
-                assert ledger.model_description.exists()
+                assert ledger.model_description.exists(), what
         found = restored(ledger)
-        assert found >= said
+        assert found >= said, what
         reached.add(found)
         whole_run(folder)
         after = contents(folder)
         for name in (*ROW_FILES, "checkpoints/round-000000004.npz", "checkpoints/round-000000003.npz", "config.yaml"):
-            assert after[name] == reference[name], name
-        assert {name for name in after if not name.endswith(".tmp")} == set(reference)
-        if code == 0:
-            break
-    else:
-        pytest.fail("never came to its end")
+            assert after[name] == reference[name], (what, name)
+        assert {name for name in after if not name.endswith(".tmp")} == set(reference), what
     assert reached == {0, 1, 2, 3, 4}
-    assert last > 100
+    assert disk.calls > 100
 
 
-def test_a_resumption_killed_before_any_call_resumes(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumption_killed_before_any_call_resumes(
+    ledger: Ledger, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
     """The newest checkpoint is damaged and rows are torn, so restoring has most to do."""
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)  # for speed
     damage_by_truncation(ledger.checkpoint_files()[0])
     (ledger.folder / METRICS).open("ab").write(b"torn")
-    before = contents(ledger.folder)
-    for last in range(1, 200):
-        for name, content in before.items():
-            (ledger.folder / name).write_bytes(content)
-        mortal = Mortal(last)
-
-        def doomed(mortal: Mortal = mortal) -> None:
-            mortal.install()
-            with RunWriter(ledger) as writer:
-                writer.restore()
-
-        code = in_a_fork(doomed)
-        assert code in (0, 9)
-        assert restored(ledger) == 2
-        if code == 0:
-            break
-    assert last > 10
+    kills = Kills(ledger.folder, tmp_path / "killed", uncompared=())
+    with Disk(ledger.folder, kills).watched() as disk, RunWriter(ledger) as writer:
+        writer.restore()
+    for what, folder in kills.moments:
+        assert restored(Ledger(folder)) == 2, what
+    assert disk.calls > 10
 
 
 # ---- a disk that refuses --------------------------------------------------------------------------------------------

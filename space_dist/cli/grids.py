@@ -326,8 +326,8 @@ def run_frozen(
 ) -> list[Standing]:  # fmt: skip
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
     _prepare(address)
-    from space_dist.grid import working_on
-    from space_dist.ray_jobs import conduct
+    from space_dist.grid import Conductor, working_on
+    from space_dist.warm import OnePlace, one_place_is_enough
 
     runs = _part(manifest.runs(), part)
     _log_to(place)
@@ -335,6 +335,13 @@ def run_frozen(
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
         observe = stack.enter_context(_display(manifest, place))
+        if address == "local" and one_place_is_enough(manifest, runs, max_parallel):
+            here = stack.enter_context(OnePlace(place, manifest, STOP.reason))
+            return Conductor(
+                place, manifest, runs, here, stop_requested=STOP.reason, observe=observe
+            ).conduct()  # fmt: skip
+        from space_dist.ray_jobs import conduct
+
         return conduct(
             place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
             stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -87,16 +87,19 @@ class _File:
 
 
 class Kills:
-    """Keeps what a kill at each call would leave behind: a copy of the folder wherever it differs from the last."""
+    """Keeps what a kill at each call would leave behind: a copy of the folder wherever it differs from the last.
 
-    def __init__(self, folder: Path, kept: Path) -> None:
-        self._folder, self._kept, self._last = folder, kept, ""
+    uncompared: names of files that make no difference.
+    """
+
+    def __init__(self, folder: Path, kept: Path, uncompared: Sequence[str] = UNCOMPARED) -> None:
+        self._folder, self._kept, self._uncompared, self._last = folder, kept, uncompared, ""
         self.moments: list[tuple[str, Path]] = []  # before what, and the copy
 
     def __call__(self, number: int, what: str) -> None:
         digest = hashlib.sha256()
         for path in sorted(self._folder.rglob("*")):
-            content = path.read_bytes() if path.is_file() and path.name not in UNCOMPARED else b""
+            content = path.read_bytes() if path.is_file() and path.name not in self._uncompared else b""
             digest.update(f"{path.relative_to(self._folder)} {len(content)} ".encode() + content)
         if digest.hexdigest() == self._last:
             return

@@ -1,0 +1,247 @@
+"""A supervisor in a process of its own, which keeps its imports from attempt to attempt; and one that needs no Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+import select
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import psutil
+
+from space_dist.errors import SpaceDistError
+from space_dist.files import in_words
+from space_dist.importing import PYTHON
+from space_dist.manifest import Grid, Manifest, Run
+from space_dist.standing import Attempts, Cause, Ended, concluded
+from space_dist.supervisor import KILL_SECONDS, STOPPED_SECONDS, Task, Turn
+
+log = logging.getLogger("space_dist")
+
+_LOOK_SECONDS = 2.0  # between two looks at whether the supervisor was stopped
+_PAUSE_SECONDS = 0.5  # before another is started where one died
+_SHARE_OF_MEMORY = 0.7  # as Ray takes it: the rest is the system's, and other people's
+_GROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of control groups, in both versions
+_CHUNK = 1 << 16
+
+
+class SupervisorLostError(Exception):
+    """It ended, or was killed, before it said how its attempts ended."""
+
+
+class WarmSupervisor:
+    """`python -m space_dist.supervisor` behind two pipes: started with its first task, and anew when it is lost.
+
+    folder: of the grid, where what it says besides goes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        self._words = b""
+        self._stopped_since: float | None = None
+
+    def begin(self, task: Task) -> None:
+        """Hand it attempts to make."""
+        if self._process is None or self._process.poll() is not None:
+            self._process, self._words = self._started(), b""
+        self._send(dataclasses.asdict(task))
+
+    def ended(self, seconds: float | None = None) -> list[dict[str, Any]] | None:
+        """How its attempts ended, in order; None if that takes longer than `seconds`.
+
+        Raises SupervisorLostError if it cannot say so any more.
+        """
+        process = self._process
+        while process is not None and process.stdout is not None:
+            line, newline, rest = self._words.partition(b"\n")
+            if newline:
+                self._words = rest
+                message: dict[str, Any] = json.loads(line)
+                if "ends" in message:
+                    return list(message["ends"])
+                continue
+            if not select.select([process.stdout], [], [], seconds)[0]:
+                return None
+            chunk = os.read(process.stdout.fileno(), _CHUNK)
+            if not chunk:
+                process.wait()
+                self._process = None
+                break
+            self._words += chunk
+        raise SupervisorLostError
+
+    def stop(self, cause: str) -> None:
+        """Ask the live attempts to checkpoint and end."""
+        self._send({"stop": cause})
+
+    def kill_if_stopped(self) -> None:
+        """Kill it if somebody has stopped it (SIGSTOP) for too long; to be called now and then."""
+        if self._process is None:
+            return
+        with contextlib.suppress(psutil.Error):
+            stopped = psutil.Process(self._process.pid).status() == psutil.STATUS_STOPPED
+            self._stopped_since = (self._stopped_since or time.monotonic()) if stopped else None
+            if self._stopped_since is not None and time.monotonic() - self._stopped_since > STOPPED_SECONDS:
+                self._process.kill()
+
+    def close(self, seconds: float) -> None:
+        """Have it end, after a checkpoint of whatever it still works on; kill it if it takes longer than `seconds`."""
+        if self._process is None or self._process.stdin is None:
+            return
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _started(self) -> subprocess.Popen[bytes]:
+        command = [*PYTHON, "-m", "space_dist.supervisor"]
+        # Nothing of a Ray actor's own identity: runs that join Ray join it as drivers.
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
+        with (self._folder / "pool.log").open("ab") as errors:
+            return subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
+            )  # fmt: skip
+
+    def _send(self, message: dict[str, Any]) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.write(json.dumps(message).encode() + b"\n")
+                self._process.stdin.flush()
+
+
+def understood(turns: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any]]) -> list[tuple[Run, Ended | None]]:
+    """What a supervisor said of its attempts, run by run; None where another process works on the run."""
+    return [
+        (run, None if end["busy"] else Ended(None if end["cause"] is None else Cause(end["cause"]), end["detail"]))
+        for (run, _), end in zip(turns, ends, strict=True)
+    ]
+
+
+def all_lost(grid: Grid, turns: Sequence[tuple[Run, int]], lost: Ended) -> list[tuple[Run, Ended | None]]:
+    """Those that are done are done; nobody but whoever manages them can say how the others ended."""
+    ended: list[tuple[Run, Ended | None]] = []
+    for run, attempt in turns:
+        ledger = grid.ledger(run)
+        if (how := concluded(ledger, attempt)) is None:
+            how = lost
+            Attempts(ledger).end(attempt, lost)
+        ended.append((run, how))
+    return ended
+
+
+def unless_all_end(ended: Ended, reason: str | None) -> Ended:
+    """A batch system that ends a job signals all its processes, and so us, too: that is nobody's failure.
+
+    reason: why we were asked to end, if we were.
+    """
+    return ended if reason is None else Ended(Cause.PREEMPTED, f"all processes were asked to end ({reason})")
+
+
+class OnePlace:
+    """An `Executor` of one place on this machine, for runs without rollout actors: there is nothing for Ray to do."""
+
+    size = 1
+
+    def __init__(self, grid: Grid, manifest: Manifest, stop_requested: Callable[[], str | None]) -> None:
+        self._grid, self._stop_requested = grid, stop_requested
+        self._supervisor = WarmSupervisor(grid.folder)
+        self._seconds = manifest.resources.grace_seconds + KILL_SECONDS
+        self._turns: Sequence[tuple[Run, int]] = ()
+        self._not_before = self._looked = 0.0
+        self.memory_mb = memory_of_a_core()
+
+    def __enter__(self) -> OnePlace:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._supervisor.close(2 * self._seconds)
+
+    def room(self) -> int:
+        """See `grid.Executor`."""
+        return int(not self._turns and time.monotonic() >= self._not_before)
+
+    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+        """See `grid.Executor`."""
+        each = tuple(Turn(run.cell.id, run.seed, attempt) for run, attempt in turns)
+        try:
+            self._supervisor.begin(Task(str(self._grid.folder), each))
+        except OSError as error:
+            raise SpaceDistError(
+                f"cannot start a process for the runs of {self._grid.folder}: {in_words(error)}"
+            ) from None
+        self._turns = turns
+
+    def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a supervisor does not outlive its conductor
+        """See `grid.Executor`."""
+        return []
+
+    def stop(self) -> None:
+        """See `grid.Executor`."""
+        if self._turns:
+            self._supervisor.stop(Cause.STOPPED.value)
+
+    def poll(self) -> list[tuple[Run, Ended | None]]:
+        """See `grid.Executor`."""
+        if not self._turns:
+            return []
+        try:
+            if (ends := self._supervisor.ended(0.0)) is None:
+                self._look()
+                return []
+            found = understood(self._turns, ends)
+        except SupervisorLostError:
+            log.warning("lost the supervisor")
+            lost = unless_all_end(Ended(Cause.KILLED, "its supervisor was killed"), self._stop_requested())
+            found = all_lost(self._grid, self._turns, lost)
+            self._not_before = time.monotonic() + _PAUSE_SECONDS
+        self._turns = ()
+        return found
+
+    def _look(self) -> None:
+        if time.monotonic() - self._looked > _LOOK_SECONDS:
+            self._looked = time.monotonic()
+            self._supervisor.kill_if_stopped()
+
+
+def one_place_is_enough(manifest: Manifest, runs: Sequence[Run], max_parallel: int | None) -> bool:
+    """Whether all there is to do here is done one after another, by processes that need no Ray themselves."""
+    return not manifest.resources.workers and min(max_parallel or cores(), len(runs)) <= 1
+
+
+def cores() -> int:
+    """CPUs that are ours: SLURM may give us fewer than it lets us see."""
+    found, given = len(os.sched_getaffinity(0)), os.environ.get("SLURM_CPUS_PER_TASK", "")
+    return min(found, int(given)) if given.isdecimal() and int(given) else found
+
+
+def slurms_memory_of_a_core() -> list[float]:
+    """MB, each way in which SLURM says it, if it does: it may give us less than it lets us see."""
+    shares = []
+    if (given := os.environ.get("SLURM_MEM_PER_CPU", "")).isdecimal():
+        shares.append(float(given))
+    if (given := os.environ.get("SLURM_MEM_PER_NODE", "")).isdecimal():
+        shares.append(float(given) / cores())
+    return shares
+
+
+def memory_of_a_core() -> float:
+    """What a process on one of our CPUs may use, in MB: its share of what is free and of what our group is allowed."""
+    free = float(psutil.virtual_memory().available)
+    for name in _GROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # "max": no limit
+            free = min(free, float((Path("/sys/fs/cgroup") / name).read_text()))
+    return min(_SHARE_OF_MEMORY * free / cores() / 2**20, *slurms_memory_of_a_core(), float("inf"))
