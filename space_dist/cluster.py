@@ -165,9 +165,7 @@ class InProcess:
     ) -> list[Handle]:
         """See `Cluster`."""
         asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
-        return [
-            self._worker.collect(policy, selection, walk, shard=shard, **asked) for shard in range(self._setup.shards)
-        ]
+        return [*self._worker.collect_all(policy, selection, walk, **asked)]
 
     def start_values(self, policy: Handle) -> list[Handle]:
         """See `Cluster`."""

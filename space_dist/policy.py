@@ -301,22 +301,26 @@ def blind(policy: Policy, action_space: spaces.Space[Any], version: int) -> Blin
 def side_by_side(policies: Sequence[Policy], rows: int) -> Acting:
     """One policy that acts for several, of which each has `rows` rows of the observations, in order.
 
-    Each acts as it does alone, bit for bit. Raises TypeError for several that are not multilayer perceptrons of one
-    shape with the same kind of head, Gaussian or categorical.
+    Each acts as it does alone, bit for bit. Raises TypeError for several that cannot: see `can_act_side_by_side`.
     """
     if len(policies) == 1:
         return policies[0]
     return _SideBySide(policies, rows)
 
 
+def can_act_side_by_side(policies: Sequence[Policy]) -> bool:
+    """Whether all are multilayer perceptrons of one shape with the same kind of head, Gaussian or categorical."""
+    mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
+    shapes = {(one.head.kind, one.activation, *(weight.shape for weight, _ in one.actor)) for one in mlps}
+    return len(mlps) == len(policies) and len(shapes) == 1 and mlps[0].head.kind in ("gaussian", "categorical")
+
+
 class _SideBySide:
     def __init__(self, policies: Sequence[Policy], rows: int) -> None:
+        if not can_act_side_by_side(policies):
+            raise TypeError("only multilayer perceptrons of one shape, Gaussian or categorical, act side by side")
         mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
-        first = mlps[0] if mlps else None
-        if first is None or len(mlps) < len(policies) or {one.head.kind for one in mlps} - {"gaussian", "categorical"}:
-            raise TypeError("only multilayer perceptrons with Gaussian or categorical heads act side by side")
-        if len({(one.head.kind, one.activation, *(weight.shape for weight, _ in one.actor)) for one in mlps}) > 1:
-            raise TypeError("only policies of one shape act side by side")
+        first = mlps[0]
         self._shape, self._activation = (len(mlps), rows), first.activation
         self._layers = tuple(
             (np.stack([weight for weight, _ in layer]), np.stack([bias for _, bias in layer])[:, None])

@@ -25,7 +25,7 @@ from space_dist.envs import BatchedEnv, Observations, make_batched
 from space_dist.envs.observations import allocate, concatenate, distinct, put, rows, take
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.policy import Noise, Policy, Several, Valuing, members_of, side_by_side
+from space_dist.policy import Noise, Policy, Several, Valuing, can_act_side_by_side, members_of, side_by_side
 from space_dist.seeding import Purpose, episode_seeds, generator
 from space_dist.walk import Unfinished, Walk
 
@@ -34,7 +34,7 @@ IntArray = NDArray[np.int64]
 Split = Literal["train", "test"]
 
 CHUNK = 65_536  # start observations scored by one call
-_SHARED = -1
+_SHARED, _TOGETHER = -1, -2  # the stages of all shards beyond LIVE, and of all side by side
 BLOCK = 2_048  # rows of one matrix product: what fits the cache. Both are part of every result
 LIVE = 64  # shards whose episodes a worker keeps going between rounds. Decides no result
 
@@ -257,6 +257,24 @@ class Worker:
         self._evaluating: dict[int, BatchedEnv] = {}
         self._scoring: BatchedEnv | None = None
         self._starts: dict[int, tuple[Observations, IntArray | None]] = {}
+
+    def collect_all(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> list[Shard]:
+        """All shards of one round; `asked`: see `Setup.rollout`.
+
+        They are collected side by side if the policy can act so: a step of many slots takes hardly longer than one of
+        few. The bits are the same.
+        """
+        setup, shards = self._setup, range(self._setup.shards)
+        together = 1 < len(shards) <= LIVE and setup.episodes_per_round is None
+        if not together or not can_act_side_by_side(members_of(policy)):
+            return [self.collect(policy, selection, walk, shard=shard, **asked) for shard in shards]
+        if _TOGETHER not in self._stages:
+            self._stages[_TOGETHER] = Stage(setup.make_env(len(shards) * setup.slots))
+        return collect(
+            self._stages[_TOGETHER],
+            [setup.rollout(policy, selection, walk, shard=shard, **asked) for shard in shards],
+            length=setup.slot_length, keep_next_observations=setup.keep_next_observations,
+        )  # fmt: skip
 
     def collect(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> Shard:
         """One shard of one round; `asked`: see `Setup.rollout`."""
