@@ -28,11 +28,12 @@ import psutil
 import ray
 from ray.exceptions import RayActorError, RayError
 
+from space_dist.endings import Cause, Ended, Evidence
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.importing import PYTHON
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import Attempts, Cause, Ended, concluded
+from space_dist.standing import settled
 from space_dist.supervisor import STOPPED_SECONDS, Task, Turn, ray_answers
 
 log = logging.getLogger("space_dist")
@@ -89,9 +90,9 @@ class PoolWorker:
                 self._process.stdin.write(json.dumps(message).encode() + b"\n")
                 self._process.stdin.flush()
 
-    def stop(self, cause: str) -> None:
+    def stop(self) -> None:
         """Ask the live attempt to checkpoint and end."""
-        self._send({"stop": cause})
+        self._send({"stop": True})
 
     def sign(self) -> str:
         """A sign of life: the id of the node. Kills a supervisor that somebody has stopped (SIGSTOP) for too long."""
@@ -176,7 +177,7 @@ class Pool:
         """See `grid.Executor`."""
         for slot in self._slots:
             if slot.turns:
-                slot.actor.stop.remote(Cause.STOPPED.value)
+                slot.actor.stop.remote()
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
@@ -211,22 +212,15 @@ class Pool:
         self, turns: Sequence[tuple[Run, int]], message: dict[str, Any] | None
     ) -> list[tuple[Run, Ended | None]]:  # fmt: skip
         if message is None:
-            return self._all_lost(turns, self._unless_all_end(Ended(Cause.KILLED, "its supervisor was killed")))
+            return self._all_lost(turns, Evidence(gone="supervisor", all_asked=self._stop_requested() or ""))
         return [
             (run, None if end["busy"] else Ended(None if end["cause"] is None else Cause(end["cause"]), end["detail"]))
             for (run, _), end in zip(turns, message["ends"], strict=True)
         ]
 
-    def _all_lost(self, turns: Sequence[tuple[Run, int]], lost: Ended) -> list[tuple[Run, Ended | None]]:
+    def _all_lost(self, turns: Sequence[tuple[Run, int]], seen: Evidence) -> list[tuple[Run, Ended | None]]:
         """Those that are done are done; nobody but us can say how the others ended."""
-        ended: list[tuple[Run, Ended | None]] = []
-        for run, attempt in turns:
-            ledger = self._grid.ledger(run)
-            if (how := concluded(ledger, attempt)) is None:
-                how = lost
-                Attempts(ledger).end(attempt, lost)
-            ended.append((run, how))
-        return ended
+        return [(run, settled(self._grid.ledger(run), attempt, seen)) for run, attempt in turns]
 
     def _listen(self, slot: _Slot) -> None:
         """Ask for a sign of life now and then; whoever gives none for too long is killed, and found dead next time."""
@@ -240,16 +234,10 @@ class Pool:
             slot.heard = now
             ray.kill(slot.actor)
 
-    def _lost(self, slot: _Slot) -> Ended:
+    def _lost(self, slot: _Slot) -> Evidence:
         alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
-        if slot.node is not None and slot.node not in alive:
-            return Ended(Cause.NODE_LOST, "the node of its worker is gone")
-        return self._unless_all_end(Ended(Cause.KILLED, "its worker was killed"))
-
-    def _unless_all_end(self, ended: Ended) -> Ended:
-        """A batch system that ends a job signals all its processes, and so us, too: that is nobody's failure."""
-        reason = self._stop_requested()
-        return ended if reason is None else Ended(Cause.PREEMPTED, f"all processes were asked to end ({reason})")
+        node_alive = slot.node is None or slot.node in alive
+        return Evidence(gone="worker", node_alive=node_alive, all_asked=self._stop_requested() or "")
 
     def _hire(self) -> _Slot:
         # Never restarted by Ray: who hires knows what it was doing.

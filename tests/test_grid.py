@@ -21,13 +21,14 @@ import pytest
 
 from space_dist import config as configs
 from space_dist import supervisor
+from space_dist.endings import Cause, Ended
 from space_dist.errors import ConfigError, Interrupted, LedgerError
 from space_dist.grid import Conductor
 from space_dist.ledger import METRICS, Lock, Row
 from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
 from space_dist.planning import plan
 from space_dist.provenance import source_digest
-from space_dist.standing import Attempts, Cause, Ended, concluded, exit_code, last_lines, standing_of, standings
+from space_dist.standing import Attempts, concluded, exit_code, last_lines, standing_of, standings
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
 from tests.test_report import continue_run, start_run
