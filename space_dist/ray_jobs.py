@@ -29,12 +29,13 @@ import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
 from space_dist.distributed import attended, join_ray, remove_session
+from space_dist.endings import Busy, Ended, Evidence
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.grid import Conductor, Overview
 from space_dist.importing import PYTHON
 from space_dist.manifest import Grid, Manifest, Run
 from space_dist.ray_pool import Nonce, Pool
-from space_dist.standing import Attempts, Cause, Ended, Standing, concluded
+from space_dist.standing import Attempts, Standing, settled
 from space_dist.supervisor import Turn, ray_answers
 from space_dist.warm import cores, slurms_memory_of_a_core
 
@@ -250,16 +251,11 @@ class Jobs:
 
     def _how(self, run: Run, attempt: int, details: JobDetails | None) -> Ended | None:
         """How a job's attempt ended: what its supervisor wrote; if it was lost, what Ray says."""
-        ledger = self._grid.ledger(run)
-        if (found := concluded(ledger, attempt)) is not None:
-            return found
-        if details is not None and details.status == JobStatus.SUCCEEDED:
-            return None  # somebody else is working on the run
-        message = (details.message if details is not None else None) or "its job is gone"
-        node = any(word in message.lower() for word in ("node", "head", "unexpected", "supervisor actor"))
-        lost = Ended(Cause.NODE_LOST if node else Cause.KILLED, message.splitlines()[0][:500])
-        Attempts(ledger).end(attempt, lost)
-        return lost
+        seen = Evidence(job="") if details is None else Evidence(
+            job=details.message or "", job_succeeded=details.status == JobStatus.SUCCEEDED
+        )  # fmt: skip
+        ended = settled(self._grid.ledger(run), attempt, seen)
+        return None if isinstance(ended, Busy) else ended
 
     def _end_if_silent(self, job: str, run: Run, attempt: int) -> None:
         attempts = Attempts(self._grid.ledger(run))

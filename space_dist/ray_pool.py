@@ -25,12 +25,12 @@ os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 import ray
 from ray.exceptions import RayActorError, RayError
 
+from space_dist.endings import Ended, Evidence
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.ledger import believed_alive, this_process
 from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import Cause, Ended
 from space_dist.supervisor import Task, Turn, ray_answers
-from space_dist.warm import SupervisorLostError, WarmSupervisor, all_lost, understood, unless_all_end
+from space_dist.warm import SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
 
 log = logging.getLogger("space_dist")
 
@@ -56,9 +56,9 @@ class PoolWorker:
         except SupervisorLostError:
             return None
 
-    def stop(self, cause: str) -> None:
+    def stop(self) -> None:
         """Ask the live attempt to checkpoint and end."""
-        self._supervisor.stop(cause)
+        self._supervisor.stop()
 
     def sign(self) -> str:
         """A sign of life: the id of the node. Kills a supervisor that somebody has stopped (SIGSTOP) for too long."""
@@ -137,7 +137,7 @@ class Pool:
         """See `grid.Executor`."""
         for slot in self._slots:
             if slot.turns:
-                slot.actor.stop.remote(Cause.STOPPED.value)
+                slot.actor.stop.remote()
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
@@ -148,7 +148,10 @@ class Pool:
                 if turns and ray.wait([slot.answer], timeout=0)[0]:
                     ends = ray.get(slot.answer)
                     slot.turns, slot.answer = (), None
-                    ended += understood(turns, ends) if ends is not None else self._killed(turns)
+                    if ends is None:
+                        ended += all_lost(self._grid, turns, supervisor_lost(self._stop_requested()))
+                    else:
+                        ended += understood(turns, ends)
                 else:
                     self._listen(slot)
             except RayActorError as error:
@@ -180,15 +183,10 @@ class Pool:
             slot.heard = now
             ray.kill(slot.actor)
 
-    def _lost(self, slot: _Slot) -> Ended:
+    def _lost(self, slot: _Slot) -> Evidence:
         alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
-        if slot.node is not None and slot.node not in alive:
-            return Ended(Cause.NODE_LOST, "the node of its worker is gone")
-        return unless_all_end(Ended(Cause.KILLED, "its worker was killed"), self._stop_requested())
-
-    def _killed(self, turns: Sequence[tuple[Run, int]]) -> list[tuple[Run, Ended | None]]:
-        lost = unless_all_end(Ended(Cause.KILLED, "its supervisor was killed"), self._stop_requested())
-        return all_lost(self._grid, turns, lost)
+        node_alive = slot.node is None or slot.node in alive
+        return Evidence(gone="worker", node_alive=node_alive, all_asked=self._stop_requested() or "")
 
     def _hire(self) -> _Slot:
         # Never restarted by Ray: who hires knows what it was doing.

@@ -12,10 +12,10 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
+from space_dist.endings import Busy, Cause, Ended, Evidence, why_ended
 from space_dist.errors import LedgerError
 from space_dist.files import in_words, open_own
 from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, process_of, this_process
@@ -24,44 +24,6 @@ from space_dist.manifest import Grid, Manifest, Retry, Run
 ATTEMPTS = "attempts.jsonl"
 MAX_DETAIL = 4000  # characters
 _MAX_BYTES = 16 << 20
-
-
-class Cause(StrEnum):
-    """Why an attempt ended before its run was done."""
-
-    CONFIG_ERROR = "config_error"
-    OUT_OF_MEMORY = "out_of_memory"
-    PREEMPTED = "preempted"
-    NODE_LOST = "node_lost"
-    TIMEOUT = "timeout"
-    CRASH = "crash"
-    KILLED = "killed"
-    STOPPED = "stopped"  # on the user's own request; not a failure
-
-    @property
-    def in_words(self) -> str:
-        """For people."""
-        return _WORDS[self]
-
-
-_WORDS = {
-    Cause.CONFIG_ERROR: "config error",
-    Cause.OUT_OF_MEMORY: "out of memory",
-    Cause.PREEMPTED: "preempted",
-    Cause.NODE_LOST: "node lost",
-    Cause.TIMEOUT: "timeout",
-    Cause.CRASH: "crash",
-    Cause.KILLED: "killed by an unknown hand",
-    Cause.STOPPED: "stopped",
-}
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How an attempt ended. cause: None where its run is done. detail: one or more lines for people."""
-
-    cause: Cause | None
-    detail: str = ""
 
 
 @dataclass(frozen=True)
@@ -176,9 +138,8 @@ def slurm_job() -> dict[str, Any]:
 def unheard(where: Mapping[str, Any]) -> Ended:
     """How an attempt ended that nobody has written the end of; `where` is its own."""
     here = slurm_job()
-    if here and where.get("slurm_job") == here["slurm_job"] and where.get("restarts", 0) < here["restarts"]:
-        return Ended(Cause.PREEMPTED, "SLURM requeued its job")
-    return Ended(Cause.KILLED, "not heard of again")
+    same = bool(here) and where.get("slurm_job") == here["slurm_job"]
+    return why_ended(Evidence(requeued=same and where.get("restarts", 0) < here["restarts"]))
 
 
 Condition = Literal["done", "running", "waiting", "failed"]
@@ -223,7 +184,8 @@ def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
     try:
         status = ledger.status() if ledger.status_file.exists() else None
     except LedgerError as error:
-        return Standing(run, ledger, "failed", 0, budget, history.begun, Cause.CRASH, str(error))
+        damaged = why_ended(Evidence(damage=str(error)))
+        return Standing(run, ledger, "failed", 0, budget, history.begun, damaged.cause, damaged.detail)
     steps = status.steps if status is not None else 0
     if status is not None and status.state == "done":
         return Standing(
@@ -237,8 +199,7 @@ def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
     if last is None and history.begun and believed_alive(history.where):  # it loads its libraries
         return Standing(run, ledger, "running", steps, budget, history.begun)
     if last is None and history.begun:  # its supervisor is gone, and told nobody why
-        host = history.where.get("host", "an unknown host")
-        last = Ended(Cause.KILLED, f"it began on {host} and was not heard of again")
+        last = why_ended(Evidence(began_on=str(history.where.get("host", "an unknown host"))))
     if last is None or last.cause is None:
         return Standing(run, ledger, "waiting", steps, budget, history.begun)
     condition: Condition = "waiting" if may_retry(last.cause, history.ends, retry) else "failed"
@@ -267,6 +228,16 @@ def concluded(ledger: Ledger, attempt: int) -> Ended | None:
     if begun:
         attempts.end(attempt, Ended(None))
     return Ended(None)
+
+
+def settled(ledger: Ledger, attempt: int, seen: Evidence) -> Ended:
+    """How an attempt ended that is over: as `concluded` knows; else by what was seen of it, which is then written."""
+    if (known := concluded(ledger, attempt)) is not None:
+        return known
+    ended = why_ended(seen)
+    if not isinstance(ended, Busy):
+        Attempts(ledger).end(attempt, ended)
+    return ended
 
 
 def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:

@@ -35,12 +35,13 @@ from typing import Any
 import psutil
 
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError
+from space_dist.endings import AskedBy, Busy, Ended, Evidence, Said, why_ended
+from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.files import open_own
 from space_dist.importing import look_here_too
 from space_dist.interrupts import StopRequests
 from space_dist.manifest import Grid, Manifest, Run, RunResources
-from space_dist.standing import Attempts, Cause, Ended, is_done, last_lines, slurm_job
+from space_dist.standing import Attempts, is_done, last_lines, slurm_job
 
 OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
@@ -85,18 +86,13 @@ class Task:
     where: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Busy(Ended):
-    """The attempt was none: another process is working on the run."""
-
-
 class Supervisor:
     """Forks a process for each attempt and watches it. Must be used from a process without other threads."""
 
     def __init__(self) -> None:
         self._manifests: dict[str, tuple[int, Manifest]] = {}
 
-    def attempt(self, task: Task, stop_requested: Callable[[], Cause | None]) -> list[Ended]:
+    def attempt(self, task: Task, stop_requested: Callable[[], AskedBy | None]) -> list[Ended]:
         """Make the attempts of `task` and record them; returns how each ended, in order. Asks `stop_requested` often.
 
         Raises LedgerError if the grid's folder cannot be read or written.
@@ -111,15 +107,12 @@ class Supervisor:
             Attempts(grid.ledger(run)).begin(begun[run.key].attempt, {**slurm_job(), **task.where})
         found = self._attempted(grid, manifest, mine, task.address, stop_requested) if mine else {}
         for run in mine:
-            ended = found[run.key]
-            if isinstance(ended, Busy):
-                ended = Ended(Cause.STOPPED, "another process is working on it")
-            Attempts(grid.ledger(run)).end(begun[run.key].attempt, ended)
-        return [found.get(run.key, Busy(None, "another process is working on it")) for run in runs]
+            Attempts(grid.ledger(run)).end(begun[run.key].attempt, found[run.key].on_record)
+        return [found.get(run.key, why_ended(Evidence(held=True))) for run in runs]
 
     def _attempted(
         self, grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str,
-        stop_requested: Callable[[], Cause | None],
+        stop_requested: Callable[[], AskedBy | None],
     ) -> dict[str, Ended]:  # fmt: skip
         """How each of the runs ended, by its key, that one process worked on."""
         out_of_memory_before = _system_kills()
@@ -133,22 +126,17 @@ class Supervisor:
             watch.look(stop_requested)
             time.sleep(_LOOK_SECONDS)
         child.clean()
-        system_killed = _system_kills() > out_of_memory_before
+        has_actors = manifest.resources.workers > 0
+        seen = dataclasses.replace(
+            watch.seen, runs=len(runs), code=code, oom_killed=_system_kills() > out_of_memory_before,
+            has_actors=has_actors, ray_answers=not (has_actors and code == -signal.SIGABRT) or ray_answers(address),
+            stop_file=grid.stop_file.exists(), output=tuple(last_lines(output)),
+        )  # fmt: skip
         found: dict[str, Ended] = {}
         for run in runs:
             said = child.said.get(run.key)
-            if said is not None and said["code"] == 0:
-                done = is_done(grid.ledger(run))  # an exit code proves nothing
-                found[run.key] = Ended(None) if done else Ended(Cause.CRASH, "it said that it was done, and is not")
-            elif said is not None and said["error"] == RunLockedError.__name__:
-                found[run.key] = Busy(None, said["message"])
-            else:
-                own = said is not None and said["code"] != Interrupted.exit_code
-                lost = None if own else watch.reason or _lost_with_ray(code, said, manifest, address)
-                found[run.key] = lost or _why(said["code"] if said else code, said or {}, grid, system_killed)
-            if found[run.key].cause in (Cause.CRASH, Cause.CONFIG_ERROR):
-                lines = [*filter(None, [found[run.key].detail]), *last_lines(output)]
-                found[run.key] = Ended(found[run.key].cause, "\n".join(lines[-6:]))
+            done = said is not None and said.code == 0 and is_done(grid.ledger(run))  # an exit code proves nothing
+            found[run.key] = why_ended(dataclasses.replace(seen, said=said, done=done))
         return found
 
     def _manifest(self, grid: Grid) -> Manifest:
@@ -172,7 +160,7 @@ class _Child:
     def __init__(self, pid: int, pipe: int) -> None:
         self.pid, self._pipe = pid, pipe
         os.set_blocking(pipe, False)
-        self.said: dict[str, dict[str, Any]] = {}
+        self.said: dict[str, Said] = {}
         self._process = psutil.Process(pid)
         self._code: int | None = None
         self._words = b""
@@ -243,24 +231,24 @@ class _Child:
         for line in lines:
             with contextlib.suppress(ValueError, KeyError, TypeError):
                 found = json.loads(line)
-                self.said[found["run"]] = {"code": int(found["code"]), "error": str(found["error"]),
-                                           "message": str(found["message"])}  # fmt: skip
+                self.said[found["run"]] = Said(int(found["code"]), str(found["error"]), str(found["message"]))
 
 
 @dataclass
 class _Watch:
-    """Looks after a child, and remembers why it was ended, if it was."""
+    """Looks after a child, and remembers what it saw for which it ended it, or asked it to end."""
 
     child: _Child
     resources: RunResources
     attempts: Sequence[Attempts]  # that share its process, and so the sum of what each may use
-    reason: Ended | None = None
+    seen: Evidence = field(default_factory=Evidence)
     began: float = field(default_factory=time.monotonic)
     kill_at: float | None = None
+    killed: bool = False
     stopped_since: float | None = None
     last_sign: float = 0.0
 
-    def look(self, stop_requested: Callable[[], Cause | None]) -> None:
+    def look(self, stop_requested: Callable[[], AskedBy | None]) -> None:
         now = time.monotonic()
         if now - self.last_sign > _SIGN_SECONDS:
             self.last_sign = now
@@ -269,18 +257,16 @@ class _Watch:
         used, state = self._used()
         limit, members = self.resources.memory_mb, len(self.attempts)
         if limit is not None and used > members * limit << 20:
-            allowed = f"memory_mb is {limit}" + (f", for each of {members} runs" if members > 1 else "")
-            self._end(Ended(Cause.OUT_OF_MEMORY, f"its processes used {used >> 20} MB; {allowed}"))
+            self._end(dataclasses.replace(self.seen, over_memory=(used >> 20, limit)))
         self.stopped_since = (self.stopped_since or now) if state == psutil.STATUS_STOPPED else None
         if self.stopped_since is not None and now - self.stopped_since > STOPPED_SECONDS:
-            self._end(Ended(Cause.KILLED, f"it was stopped by a signal (SIGSTOP) for {STOPPED_SECONDS:.0f} s"))
+            self._end(dataclasses.replace(self.seen, halted_seconds=STOPPED_SECONDS))
         if self.kill_at is None:
-            minutes, asked = self.resources.minutes, stop_requested()
-            if asked is not None:
-                self._ask(Ended(asked))
+            minutes, asked_by = self.resources.minutes, stop_requested()
+            if asked_by is not None:
+                self._ask(dataclasses.replace(self.seen, asked_by=asked_by))
             elif minutes is not None and now - self.began > 60.0 * minutes * members:
-                allowed = f"{minutes:g} minutes" + (f" for each of {members} runs" if members > 1 else "")
-                self._ask(Ended(Cause.TIMEOUT, f"it took longer than {allowed}"))
+                self._ask(dataclasses.replace(self.seen, over_minutes=minutes))
         elif now > self.kill_at:
             self.child.kill()
 
@@ -293,22 +279,15 @@ class _Watch:
                 state = state or process.status()
         return used, state
 
-    def _ask(self, reason: Ended) -> None:
-        self.reason = reason
+    def _ask(self, seen: Evidence) -> None:
+        self.seen = seen
         self.kill_at = time.monotonic() + self.resources.grace_seconds + KILL_SECONDS
         self.child.signal(signal.SIGTERM)
 
-    def _end(self, reason: Ended) -> None:
-        self.reason = self.reason or reason
+    def _end(self, seen: Evidence) -> None:
+        if not self.killed:  # what is seen of a process that dies is no reason of its death
+            self.seen, self.killed = seen, True
         self.child.kill()
-
-
-def _lost_with_ray(code: int, said: Mapping[str, Any] | None, manifest: Manifest, address: str) -> Ended | None:
-    """Ray ends a process at once, and without a word to it, when the Ray of its node is gone."""
-    silent = code == 1 and not said
-    if manifest.resources.workers and (silent or (code == -signal.SIGABRT and not ray_answers(address))):
-        return Ended(Cause.NODE_LOST, "Ray on its node is gone, and the run with it")
-    return None
 
 
 def ray_answers(address: str) -> bool:
@@ -321,22 +300,6 @@ def ray_answers(address: str) -> bool:
     except OSError:
         return False
     return True
-
-
-def _why(code: int, said: Mapping[str, Any], grid: Grid, system_killed: bool) -> Ended:
-    """Why a run ended that nobody here ended: by its own exit code, or its process's if it has said nothing."""
-    message = said.get("message", "")
-    if code == Interrupted.exit_code:
-        return Ended(Cause.STOPPED if grid.stop_file.exists() else Cause.PREEMPTED, message)
-    if code == ConfigError.exit_code:
-        return Ended(Cause.CONFIG_ERROR, message)
-    if said.get("error") == MemoryError.__name__ or (code == -signal.SIGKILL and system_killed):
-        return Ended(Cause.OUT_OF_MEMORY, message or "the system had no memory left, and killed it")
-    if code == -signal.SIGKILL:
-        return Ended(Cause.KILLED, "SIGKILL")
-    if code < 0:
-        return Ended(Cause.CRASH, f"ended by {signal.Signals(-code).name}")
-    return Ended(Cause.CRASH, message or f"its process ended with exit code {code} and without a word")
 
 
 def _system_kills() -> int:
@@ -372,14 +335,12 @@ def _child_main(work: Callable[[Tell], None], output: Path, pipe: int) -> int:
     def tell(run: Run, error: SpaceDistError | None) -> None:
         if os.getpid() != own:  # a copy that the run's environment has forked
             return
-        kind, message = "", ""
+        said = Said.of(error)
         if error is not None:
             print(f"space-dist: {error}", file=sys.stderr)
-            kind = (MemoryError if isinstance(error.__cause__, MemoryError) else type(error)).__name__
-            message = str(error)[:_MOST_WORDS]
-        codes.append(0 if error is None else error.exit_code)
-        said = {"run": run.key, "code": codes[-1], "error": kind, "message": message}
-        os.write(pipe, json.dumps(said).encode() + b"\n")
+        codes.append(said.code)
+        row = {"run": run.key, **dataclasses.asdict(said), "message": said.message[:_MOST_WORDS]}
+        os.write(pipe, json.dumps(row).encode() + b"\n")
 
     work(tell)
     return codes[0] if len(codes) == 1 else 0
@@ -421,22 +382,22 @@ class _Manager:
 
     def __init__(self) -> None:
         self._buffer = b""
-        self._asked: Cause | None = None
+        self._asked_by: AskedBy | None = None
         self.gone = False
 
     def tasks(self) -> Iterator[Task]:
         while not self.gone:
             message = self._next(None)
             if message is not None and "stop" not in message:
-                self._asked = None
+                self._asked_by = None
                 turns = tuple(Turn(**turn) for turn in message.pop("turns"))
                 yield Task(turns=turns, **message)
 
-    def stop_requested(self) -> Cause | None:
+    def stop_requested(self) -> AskedBy | None:
         message = self._next(0.0)
-        if message is not None:
-            self._asked = Cause(message["stop"])
-        return self._asked or (Cause.PREEMPTED if self.gone else None)
+        if message is not None and "stop" in message:
+            self._asked_by = "user"
+        return self._asked_by or ("others" if self.gone else None)
 
     def _next(self, seconds: float | None) -> dict[str, Any] | None:
         if b"\n" not in self._buffer:
@@ -466,8 +427,7 @@ def main() -> None:
         try:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
-            cause = Cause.CONFIG_ERROR if isinstance(error, ConfigError) else Cause.CRASH
-            ended = [Ended(cause, str(error)) for _ in task.turns]
+            ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.turns)
         told = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
         print(json.dumps({"ends": told}), file=results, flush=True)
 

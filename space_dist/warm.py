@@ -17,11 +17,12 @@ from typing import Any
 
 import psutil
 
+from space_dist.endings import Cause, Ended, Evidence
 from space_dist.errors import SpaceDistError
 from space_dist.files import in_words
 from space_dist.importing import PYTHON
 from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import Attempts, Cause, Ended, concluded
+from space_dist.standing import settled
 from space_dist.supervisor import KILL_SECONDS, STOPPED_SECONDS, Task, Turn
 
 log = logging.getLogger("space_dist")
@@ -79,9 +80,9 @@ class WarmSupervisor:
             self._words += chunk
         raise SupervisorLostError
 
-    def stop(self, cause: str) -> None:
+    def stop(self) -> None:
         """Ask the live attempts to checkpoint and end."""
-        self._send({"stop": cause})
+        self._send({"stop": True})
 
     def kill_if_stopped(self) -> None:
         """Kill it if somebody has stopped it (SIGSTOP) for too long; to be called now and then."""
@@ -129,24 +130,17 @@ def understood(turns: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any]])
     ]
 
 
-def all_lost(grid: Grid, turns: Sequence[tuple[Run, int]], lost: Ended) -> list[tuple[Run, Ended | None]]:
+def all_lost(grid: Grid, turns: Sequence[tuple[Run, int]], seen: Evidence) -> list[tuple[Run, Ended | None]]:
     """Those that are done are done; nobody but whoever manages them can say how the others ended."""
-    ended: list[tuple[Run, Ended | None]] = []
-    for run, attempt in turns:
-        ledger = grid.ledger(run)
-        if (how := concluded(ledger, attempt)) is None:
-            how = lost
-            Attempts(ledger).end(attempt, lost)
-        ended.append((run, how))
-    return ended
+    return [(run, settled(grid.ledger(run), attempt, seen)) for run, attempt in turns]
 
 
-def unless_all_end(ended: Ended, reason: str | None) -> Ended:
-    """A batch system that ends a job signals all its processes, and so us, too: that is nobody's failure.
+def supervisor_lost(reason: str | None) -> Evidence:
+    """A supervisor that is gone. reason: why we were asked to end, if we were.
 
-    reason: why we were asked to end, if we were.
+    A batch system that ends a job signals all its processes, and so us, too.
     """
-    return ended if reason is None else Ended(Cause.PREEMPTED, f"all processes were asked to end ({reason})")
+    return Evidence(gone="supervisor", all_asked=reason or "")
 
 
 class OnePlace:
@@ -192,7 +186,7 @@ class OnePlace:
     def stop(self) -> None:
         """See `grid.Executor`."""
         if self._turns:
-            self._supervisor.stop(Cause.STOPPED.value)
+            self._supervisor.stop()
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
@@ -205,8 +199,7 @@ class OnePlace:
             found = understood(self._turns, ends)
         except SupervisorLostError:
             log.warning("lost the supervisor")
-            lost = unless_all_end(Ended(Cause.KILLED, "its supervisor was killed"), self._stop_requested())
-            found = all_lost(self._grid, self._turns, lost)
+            found = all_lost(self._grid, self._turns, supervisor_lost(self._stop_requested()))
             self._not_before = time.monotonic() + _PAUSE_SECONDS
         self._turns = ()
         return found

@@ -21,13 +21,14 @@ import pytest
 
 from space_dist import config as configs
 from space_dist import supervisor
+from space_dist.endings import Busy, Cause, Ended, Evidence
 from space_dist.errors import ConfigError, Interrupted, LedgerError
 from space_dist.grid import Conductor
 from space_dist.ledger import METRICS, Lock, Row
 from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
 from space_dist.planning import plan
 from space_dist.provenance import source_digest
-from space_dist.standing import Attempts, Cause, Ended, concluded, exit_code, last_lines, standing_of, standings
+from space_dist.standing import Attempts, concluded, exit_code, last_lines, settled, standing_of, standings
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
 from tests.test_report import continue_run, start_run
@@ -639,6 +640,18 @@ def test_what_became_of_an_attempt_is_as_written_or_done_or_unknown(supervised: 
     attempts.begin(3, {})
     assert [concluded(ledger, 3), concluded(ledger, 3)] == [Ended(None)] * 2
     assert [row["event"] for row in attempts.rows()[len(rows) :]] == ["begin", "end"]
+
+
+def test_what_was_seen_of_a_lost_attempt_is_written_once_and_only_if_it_was_one(tmp_path: Path) -> None:
+    grid, _, run = faulty(tmp_path, "none")
+    ledger, attempts = grid.ledger(run), Attempts(grid.ledger(run))
+    attempts.begin(1, {})
+    assert isinstance(settled(ledger, 1, Evidence(job="", job_succeeded=True)), Busy)  # somebody else is working on it
+    assert attempts.history().last is None
+    lost = Ended(Cause.KILLED, "its worker was killed")
+    assert settled(ledger, 1, Evidence(gone="worker")) == attempts.history().last == lost
+    assert settled(ledger, 1, Evidence(gone="worker", node_alive=False)) == lost  # as it is on record
+    assert [row["event"] for row in attempts.rows()] == ["begin", "end"]
 
 
 def test_the_conductor_retries_by_cause_and_never_starts_more_than_fits(tmp_path: Path) -> None:

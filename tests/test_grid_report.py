@@ -18,6 +18,7 @@ import pytest
 from scipy import stats
 
 from space_dist.cli import main
+from space_dist.endings import Cause, Ended
 from space_dist.errors import ConfigError
 from space_dist.ledger import Ledger, RunWriter
 from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
@@ -39,7 +40,7 @@ from space_dist.report.statistics import (
     stratified,
 )
 from space_dist.seeding import Purpose, generator
-from space_dist.standing import Attempts, Cause, Ended
+from space_dist.standing import Attempts
 from tests.grids import SMALL, write_grid
 from tests.test_report import GROWTH, continue_run, start_run
 

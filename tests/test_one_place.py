@@ -14,10 +14,11 @@ import psutil
 import pytest
 
 from space_dist import warm
+from space_dist.endings import Cause, Ended
 from space_dist.ledger import METRICS, Row
 from space_dist.manifest import Grid
 from space_dist.planning import plan
-from space_dist.standing import Attempts, Cause, Ended
+from space_dist.standing import Attempts
 from space_dist.warm import OnePlace, memory_of_a_core, one_place_is_enough
 from tests import prepared
 from tests.grids import TINY, write_grid, write_line_instances

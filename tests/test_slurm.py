@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from space_dist import cli
+from space_dist.endings import Cause, Ended
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.grid import Conductor, adopt, working_on
 from space_dist.manifest import Grid, Manifest, Run
@@ -27,7 +28,7 @@ from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN, render
 from space_dist.slurm.node import address_facing
 from space_dist.slurm.profile import seconds
 from space_dist.slurm.queue import queue_of
-from space_dist.standing import Cause, Ended, slurm_job, unheard
+from space_dist.standing import slurm_job, unheard
 from tests.patience import PATIENCE
 from tests.slurm.profiles import exports
 

@@ -271,7 +271,8 @@ def grid_retry(
     root: Root = None,
 ) -> None:
     """Let failed runs be tried again, whatever the grid's `retry` says; they go on from their checkpoints."""
-    from space_dist.standing import Attempts, Cause
+    from space_dist.endings import Cause
+    from space_dist.standing import Attempts
 
     known = [one.value for one in Cause]
     causes = {name.strip().replace("-", "_") for text in cause for name in text.split(",")}
@@ -296,19 +297,19 @@ def grid_work(
 ) -> None:
     """One attempt of one run, or of several side by side, as a job of its own."""
     STOP.install()
+    from space_dist.endings import AskedBy, Cause
     from space_dist.place import lasting
     from space_dist.ray_pool import refuse_other_folder
-    from space_dist.standing import Cause
     from space_dist.supervisor import Supervisor, Task, Turn, preload
 
     refuse_other_folder(lasting(folder, "the grid's folder"), nonce)
     preload()
     stop_file = folder / "stop"
 
-    def stop_requested() -> Cause | None:
+    def stop_requested() -> AskedBy | None:
         if STOP.reason() is None:
             return None
-        return Cause.STOPPED if stop_file.exists() else Cause.PREEMPTED
+        return "user" if stop_file.exists() else "others"
 
     task = Task(str(folder), tuple(map(Turn.parse, turns)), "auto", {"job": job})
     failed = [ended for ended in Supervisor().attempt(task, stop_requested) if ended.cause is not None]

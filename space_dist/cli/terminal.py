@@ -107,7 +107,6 @@ from space_dist.errors import ConfigError, SpaceDistError, nearest
 console = Console()
 errors = Console(stderr=True)
 
-Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders, or folders that hold some.")]
 Overrides = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
     typer.Option("--set", metavar="KEY=VALUE", help="Override a config key, e.g. budget.steps=20000. Repeatable."),

@@ -19,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from space_dist.config import clean, flattened
+from space_dist.endings import Evidence, why_ended
 from space_dist.errors import LedgerError
 from space_dist.manifest import Cell, Grid, Manifest
 from space_dist.report.figures import HeatMap
@@ -35,7 +36,7 @@ from space_dist.report.statistics import (
     stratified,
 )
 from space_dist.report.tables import Summary, finals, summarise
-from space_dist.standing import Cause, Standing, standings
+from space_dist.standing import Standing, standings
 
 MAX_MAPS: Final = 24
 MAX_POOLED: Final = 200  # settings of which cells are pooled
@@ -127,8 +128,9 @@ def _read(standing: Standing) -> tuple[Run | None, Standing]:
     except LedgerError as error:
         if standing.condition not in ("done", "failed"):  # it is being written, or will be written anew
             return None, dataclasses.replace(standing, detail=standing.detail or str(error))
+        ended = why_ended(Evidence(damage=str(error)))
         return None, dataclasses.replace(
-            standing, condition="failed", cause=standing.cause or Cause.CRASH, detail=standing.detail or str(error)
+            standing, condition="failed", cause=standing.cause or ended.cause, detail=standing.detail or ended.detail
         )
     if run.finished and standing.condition != "done":  # since we looked
         standing = dataclasses.replace(standing, condition="done", cause=None, detail="", steps=run.status.steps)

@@ -18,11 +18,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from space_dist.endings import Cause, Evidence, why_ended
 from space_dist.errors import LedgerError
 from space_dist.ledger import METRICS, Ledger, Row, Status, decode_row
 from space_dist.manifest import Cell, Grid, Manifest, Run
 from space_dist.provenance import code_digest
-from space_dist.standing import Attempts, Cause, History, Standing, standing_of
+from space_dist.standing import Attempts, History, Standing, standing_of
 from space_dist.tracking.runs import (
     GRID_TAG,
     MAX_TAG,
@@ -313,7 +314,8 @@ def _look(run: Run, ledger: Ledger, manifest: Manifest, files: tuple[_Signature,
         status = ledger.status() if files[0] else None
         final = final_return(ledger, status) if status is not None and standing.condition == "done" else None
     except LedgerError as error:
-        standing = Standing(run, ledger, "failed", 0, run.cell.budget_steps, 0, Cause.CRASH, str(error))
+        ended = why_ended(Evidence(damage=str(error)))
+        standing = Standing(run, ledger, "failed", 0, run.cell.budget_steps, 0, ended.cause, ended.detail)
         return Look(files, standing, None, History(), 0.0, None, fault=str(error))
     # A heartbeat is no news.
     history = dataclasses.replace(history, where={k: v for k, v in history.where.items() if k != "heartbeat"})
