@@ -20,7 +20,7 @@ sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.batched_vec_env import BatchedVecEnv
 from benchmarks.contenders import TASKS, Contender, specification
-from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, process
+from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, _searched, process
 
 LINE = "tests.tiny_env:make"
 
@@ -62,6 +62,24 @@ def test_our_batched_environments_step_in_stable_baselines3s_interface_as_by_the
 def test_ratios_are_medians_of_the_rounds_own() -> None:
     # A machine that slows down to a tenth after the first round slows both.
     assert _ratio(row(400.0, 40.0, 30.0), row(100.0, 10.0, 10.0)) == pytest.approx(4.0)
+
+
+def test_what_was_found_once_is_not_searched_again(tmp_path: Path) -> None:
+    file, searches = tmp_path / "settings.json", []
+
+    def search() -> dict[str, Contender]:
+        searches.append(1)
+        return {"lean": Contender("ours", update="lean", slots=64, overrides=("a=1",))}
+
+    found = _searched("pointmass", file, search)
+    assert found == search()
+    assert found["lean"].setting == "one process, 64 slots"
+    assert _searched("pointmass", file, search) == found
+    assert len(searches) == 2
+    _searched("cartpole", file, search)
+    assert len(searches) == 3
+    assert _searched("pointmass", None, search) == found
+    assert len(searches) == 4
 
 
 def test_the_table_says_who_is_missing_and_where_time_goes() -> None:

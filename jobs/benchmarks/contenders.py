@@ -89,6 +89,7 @@ class Contender:
 
     kind: ours, sb3, sbx, rllib or jax.  threads: of torch in the learning process.
     update, workers, overlap: of ours; `population` is of so many `members`, as JAX's may be.
+    slots: of ours and JAX's, environments in a batch; 0: as many as the task says.
     overrides, checkout: of ours, more settings of the config, and another version.
     vec_env, n_envs: SB3's and SBX's dummy or subproc, or batched, ours in its interface.
     runners, n_envs: RLlib's processes and the environments of each.  flags: XLA's.
@@ -104,6 +105,7 @@ class Contender:
     runners: int = 0
     flags: str = ""
     members: int = 1
+    slots: int = 0
     overrides: tuple[str, ...] = ()
     checkout: str = ""
 
@@ -137,13 +139,14 @@ class Contender:
     def setting(self) -> str:
         """What was chosen for it."""
         threads = f"{self.threads} torch thread{'s' if self.threads > 1 else ''}"
+        slots = f", {self.slots} slots" if self.slots else ""
         if self.kind == "jax" or self.update == "population":
-            members = f"{self.members} member{'s' if self.members > 1 else ''} on a core"
+            members = f"{self.members} member{'s' if self.members > 1 else ''} on a core{slots}"
             return f"{members}, XLA_FLAGS={self.flags!r}" if self.kind == "jax" else members
         if self.kind == "sbx":
             return f"XLA_FLAGS={self.flags!r}"
         if self.kind == "ours":
-            return f"{self.workers} Ray actors" if self.workers else "one process"
+            return (f"{self.workers} Ray actors" if self.workers else "one process") + slots
         if self.kind == "rllib":
             return f"{self.runners} env runners of {self.n_envs}, {threads}"
         return threads
@@ -192,9 +195,10 @@ def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     from space_dist.ledger import Ledger
     from space_dist.training import Progress
 
+    slots = [f"rollout.slots={contender.slots}"] if contender.slots else []
     config = task.run_config(
         f"learner.update={contender.update}", f"resources.workers={contender.workers}",
-        f"rollout.overlap={str(contender.overlap).lower()}", *contender.overrides,
+        f"rollout.overlap={str(contender.overlap).lower()}", *slots, *contender.overrides,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         run, seen = Path(folder) / "run", [-1]
@@ -263,7 +267,7 @@ def _jax(task: Task, contender: Contender, mark: Callable[[int], bool]) -> float
     start = time.perf_counter()
     bounds = make_batched(config.env.id, 1, context_visible=False, kwargs=config.env.kwargs).context_bounds
     iterate, learning = jitted.prepare(
-        settings, _contexts(config, bounds), members=contender.members, n_envs=task.slots
+        settings, _contexts(config, bounds), members=contender.members, n_envs=contender.slots or task.slots
     )
     compiling = time.perf_counter() - start
     steps, enough = 0, mark(0)

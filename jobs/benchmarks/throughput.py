@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import os
@@ -12,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -29,6 +30,7 @@ CORES = 2
 PATIENCE = 60.0  # seconds for a setting that is tried, its start included: one with too many threads may take hours
 PARTS = (*TASKS, "population", "table1")
 DUMMY, SUBPROCESSES, BATCHED = (4, 8, 16, 32), (2, 4, 8), (16, 64)  # environments that are tried for rivals
+SLOTS = (16, 64)  # that are tried for ours and for JAX
 RUNNERS = ((0, 1), (0, 8), (0, 32), (2, 1), (2, 8))  # RLlib's env runners, and environments of each
 MEMBERS: dict[str, list[Any]] = {"learner.learning_rate": [1e-4, 2e-4, 3e-4, 5e-4]}  # of a population, times 8 seeds
 TABLE1: dict[str, list[Any]] = {  # docs/grids.md
@@ -111,6 +113,10 @@ def throughput(
     only: Annotated[Optional[list[str]], typer.Option(help=f"Only these parts: {', '.join(PARTS)}.")] = None,  # noqa: UP045
     member_steps: Annotated[int, typer.Option(min=2048, help="Steps of each of the 32 runs of a grid.")] = 102_400,
     before: Annotated[Optional[Path], typer.Option(help="Also measure the checkout there, in this Python.")] = None,  # noqa: UP045
+    settings: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Keep here which settings were fastest; what is kept there is not searched again."),
+    ] = None,
     out: Annotated[Optional[Path], typer.Option(help="Folder for the table and the figure.")] = None,  # noqa: UP045
     json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
 ) -> None:
@@ -123,11 +129,13 @@ def throughput(
     checkout = "" if before is None else str(before.resolve())
     parts = only or PARTS
     missing = _missing()
-    table: dict[str, dict[str, Row]] = {
-        name: _rows(name, seconds, missing, checkout) for name in TASKS if name in parts
-    }
+    table: dict[str, dict[str, Row]] = {}
+    for name in [name for name in TASKS if name in parts]:
+        found = _searched(name, settings, functools.partial(_search, name, seconds, missing))
+        table[name] = _rows(name, found, seconds, checkout)
     if "population" in parts:
-        table["population"] = _population_rows(seconds, member_steps, missing, checkout)
+        rivals = _searched("population", settings, lambda: _search_population(seconds, missing))
+        table["population"] = _population_rows(rivals, seconds, member_steps, checkout)
     for number in range(rounds):
         for name, rows in table.items():
             for row in rows.values():
@@ -166,9 +174,25 @@ def _ratio(ours: Row, rival: Row) -> float:
 # ---- who is measured ----
 
 
-def _rows(task: str, seconds: float, missing: Collection[str], checkout: str) -> dict[str, Row]:
-    """Everybody on one task, rivals with the settings that were fastest in a search."""
-    costs = process(specification(task, None, 0.0), Contender("ours").first)
+def _searched(
+    part: str, file: Path | None, search: Callable[[], dict[str, Contender]]
+) -> dict[str, Contender]:  # fmt: skip
+    """The contenders of a part with their fastest settings: as `file` has them, or as `search` finds them now."""
+    known: dict[str, Any] = {}
+    if file is not None and file.exists():
+        known = json.loads(file.read_text())
+    if part not in known:
+        known[part] = {name: asdict(contender) for name, contender in search().items()}
+        if file is not None:
+            file.write_text(json.dumps(known, indent=1) + "\n")
+    return {
+        name: Contender(**{**contender, "overrides": tuple(contender["overrides"])})
+        for name, contender in known[part].items()
+    }  # fmt: skip
+
+
+def _search(task: str, seconds: float, missing: Collection[str]) -> dict[str, Contender]:
+    """Everybody's fastest setting on one task."""
     subproc = [Contender("sb3", vec_env="subproc", n_envs=2, threads=threads) for threads in (1, CORES)]
     stock = [
         Contender("sb3", vec_env=kind, n_envs=n)
@@ -185,12 +209,25 @@ def _rows(task: str, seconds: float, missing: Collection[str], checkout: str) ->
         found["sbx"] = _best_sbx(task, seconds)
     if task in JITTED and "jax" not in missing:
         found["jax"] = _best_jax(task, seconds, members=1)
-    workers = CORES if TASKS[task].shards > 1 else 0
-    found |= {update: Contender("ours", update=update, workers=workers) for update in ("stock", "lean")}
-    if workers:
+    if TASKS[task].shards > 1:
+        found |= {update: Contender("ours", update=update, workers=CORES) for update in ("stock", "lean")}
         found["overlap"] = replace(found["lean"], overlap=True)
-    if checkout:
-        found["before"] = replace(found["lean"], checkout=checkout)
+    else:
+        for update in ("stock", "lean"):
+            ours = [Contender("ours", update=update, slots=slots) for slots in SLOTS]
+            found[update] = _best(task, ours, seconds)
+    return found
+
+
+def _rows(task: str, found: dict[str, Contender], seconds: float, checkout: str) -> dict[str, Row]:
+    """Everybody on one task.
+
+    Another version of ours is measured where it collects in its own process, with the task's slots: 2f6e945 takes none
+    that are shorter than an episode.
+    """
+    costs = process(specification(task, None, 0.0), Contender("ours").first)
+    if checkout and TASKS[task].shards == 1:
+        found = {**found, "before": replace(found["lean"], slots=0, checkout=checkout)}
     return {
         name: Row(
             contender.title, contender.setting,
@@ -208,7 +245,8 @@ def _best_sbx(task: str, seconds: float) -> Contender:
 
 
 def _best_jax(task: str, seconds: float, *, members: int) -> Contender:
-    return _best(task, [Contender("jax", members=members, flags=flags) for flags in XLA_FLAGS], seconds)
+    best = _best(task, [Contender("jax", members=members, flags=XLA_FLAGS[0], slots=slots) for slots in SLOTS], seconds)
+    return _best(task, [replace(best, flags=flags) for flags in XLA_FLAGS], seconds)
 
 
 def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
@@ -241,15 +279,25 @@ def _waits(contender: Contender, costs: dict[str, float]) -> dict[str, float]:
     return {"simulator": simulator, "arithmetic": costs["arithmetic"] / contender.threads}
 
 
-def _population_rows(
-    seconds: float, member_steps: int, missing: Collection[str], checkout: str
-) -> dict[str, Row]:  # fmt: skip
-    """Grids of 32 runs on all cores: by whole wall time, or by that of collecting and learning alone."""
-    costs = process(specification("pointmass", None, 0.0), Contender("ours").first)
+def _search_population(seconds: float, missing: Collection[str]) -> dict[str, Contender]:
+    """Everybody's fastest setting for many runs on all cores."""
     rivals = {
         "best_sb3": [Contender("sb3", vec_env="dummy", n_envs=n) for n in DUMMY],
         "sb3_batched": [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED],
     }
+    found = {name: _best("pointmass", contenders, seconds) for name, contenders in rivals.items()}
+    if "sbx" not in missing:
+        found["sbx"] = _best_sbx("pointmass", seconds)
+    if "jax" not in missing:
+        found["jax"] = _best_jax("pointmass", seconds, members=32 // CORES)
+    return found
+
+
+def _population_rows(
+    rivals: dict[str, Contender], seconds: float, member_steps: int, checkout: str
+) -> dict[str, Row]:  # fmt: skip
+    """Grids of 32 runs on all cores: by whole wall time, or by that of collecting and learning alone."""
+    costs = process(specification("pointmass", None, 0.0), Contender("ours").first)
     learning = "collecting and learning alone"
     whole, kernel = "whole wall time: start, evaluation, ledgers and checkpoints included", costs["kernel"] / CORES
     halves = {"simulator": costs["batched"] / CORES, "arithmetic": costs["arithmetic"] / CORES}
@@ -263,14 +311,10 @@ def _population_rows(
             {cause: wait / CORES for cause, wait in _waits(contender, costs).items()}, kernel,
         )  # fmt: skip
 
-    for name, contenders in rivals.items():
-        alone(name, _best("pointmass", contenders, seconds))
+    for name, contender in rivals.items():
+        alone(name, contender)
     steps, each = 32 * _whole_updates(member_steps), 32 // CORES
-    if "sbx" not in missing:
-        alone("sbx", _best_sbx("pointmass", seconds))
-    if "jax" not in missing:
-        jax = _best_jax("pointmass", seconds, members=each)
-        alone("jax", jax)
+    if jax := rivals.get("jax"):
         rows["jax_whole"] = Row(
             f"{jax.title}: 32 runs", "whole wall time: start and compiling included; neither evaluation nor ledger",
             lambda: {"rate": steps / _jax_seconds(jax, member_steps)}, {}, kernel,
