@@ -25,6 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from space_dist import arithmetic
 from space_dist import config as configs
+from space_dist.building import make_env, make_setup, policy_in, resolved
 from space_dist.cluster import Cluster, InProcess
 from space_dist.config import PPOConfig, RunConfig
 from space_dist.envs import BULLET_IDS
@@ -49,7 +50,7 @@ from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
 from space_dist.tracking.pusher import ended_within
-from space_dist.training import Progress, Training, make_env, make_setup, policy_in, resolved
+from space_dist.training import Progress, Training
 
 log = logging.getLogger("space_dist")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from space_dist import config as configs
+from space_dist.building import make_env, make_setup, memory_of, resolved, stack_of, total_steps
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, about
 from space_dist.grid import freeze
@@ -18,7 +19,6 @@ from space_dist.launch import read_instances
 from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
 from space_dist.place import absolute_uri
 from space_dist.provenance import code_digest, git_state, source_digest
-from space_dist.training import make_env, make_setup, memory_of, resolved, stack_of, total_steps
 
 
 @dataclass(frozen=True)

@@ -21,41 +21,24 @@ function of (config, seed).
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import hashlib
 import logging
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from space_dist.building import ensemble_of, learner_of, load_learner, make_env, model_of, total_steps, under
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
-from space_dist.config import GrowingConfig, PPOConfig, RunConfig, TRPOConfig
-from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
-from space_dist.envs import BatchedEnv, make_batched
-from space_dist.envs.observations import alike
+from space_dist.config import GrowingConfig, RunConfig
+from space_dist.curricula import GENERATED, Episodes, Selection, decode_state, encode_state
 from space_dist.episodes import joined_episodes, mean_sizes, summed, told
-from space_dist.errors import ConfigError, Interrupted
-from space_dist.instances import InstanceSet
-from space_dist.learner import (
-    Arrays,
-    CoupledLearner,
-    Ensemble,
-    Learner,
-    PopulationLearner,
-    Update,
-    make_ensemble,
-    make_learner,
-    member_bytes,
-    refuse_population,
-    refuse_spaces,
-    stack_key,
-)
+from space_dist.errors import Interrupted
+from space_dist.learner import Arrays, CoupledLearner, Learner, Update
 from space_dist.ledger import (
     CURRICULUM,
     METRICS,
@@ -69,108 +52,13 @@ from space_dist.ledger import (
     Status,
     encode_values,
 )
-from space_dist.policy import MlpPolicy, Policy, Several, Statistics, blind, members_of, to_arrays
+from space_dist.policy import Statistics, blind, members_of
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
-from space_dist.seeding import member_seeds
 from space_dist.walk import Unfinished, Walk, stacked, unstacked
 
 log = logging.getLogger("space_dist")
 
-ON_POLICY = ("ppo", "trpo", "a2c")
 PROBE = (1 << 32) - 1  # the round in which first scales are measured
-_COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
-
-
-def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setup:
-    """What workers must know. Raises ConfigError if the config cannot work with its environment or instances."""
-    horizon = make_env(config).horizon
-    setup = Setup(
-        env_id=config.env.id,
-        context_visible=config.env.context_visible,
-        seed=config.seed,
-        gamma=config.learner.gamma,
-        shards=config.rollout.shards * config.members,
-        slots=config.rollout.slots,
-        slot_length=config.slot_length(horizon),
-        start_states=config.rollout.start_states,
-        evaluation_episodes=config.evaluation.episodes,
-        train=train,
-        test=test,
-        env_kwargs=config.env.kwargs,
-        episodes_per_round=config.n_episodes,
-        keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
-        members=config.members,
-    )
-    probes = config.learner.normalize_observations or config.learner.normalize_rewards
-    needed = config.round_steps(horizon) * (2 if probes else 1)
-    if config.budget.steps < needed:
-        raise ConfigError(
-            f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
-            + (", and the round before it that gives normalisation its first scales" if probes else "")
-        )
-    env = make_env(config)
-    refuse_spaces(config.learner, env.observation_space, env.action_space)
-    if config.engine == "population":
-        refuse_population(config.learner, env.observation_space, env.action_space)
-    if config.curriculum.ranks_by_start_value and _starts_alike(config, train):
-        raise ConfigError(
-            f"curriculum.kind: {config.curriculum.kind} ranks instances by the value of their start, but all instances "
-            "start with the same observation, so all values tie and the order would be a random one. Set "
-            "env.context_visible: true"
-            + (
-                ", or curriculum.allow_context_blind: true to run the released code's setting"
-                if "allow_context_blind" in type(config.curriculum).model_fields
-                else ""
-            )
-        )
-    # Asks the curriculum for what is not there? Better refused now than on an actor.
-    _refuse_wants(config, make_curriculum(config, train))
-    ensemble_of(config)
-    return setup
-
-
-def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
-    """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
-    kind, learner = config.curriculum.kind, config.learner.kind
-    if curriculum.wants.advantages and learner not in ON_POLICY:
-        raise ConfigError(
-            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
-            f"compute. Allowed learners: {', '.join(ON_POLICY)}"
-        )
-    if config.curriculum.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
-        raise ConfigError(
-            f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
-            "not say (its steps have no `success`)"
-        )
-
-
-def _knows_success(config: RunConfig, contexts: NDArray[np.float64]) -> bool:
-    """Whether a first step in a (1, d) context reports success, true or not."""
-    with _failures_explained(config, "reset or a first step"):
-        env = make_env(config)
-        env.action_space.seed(0)
-        env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
-        return env.step(np.asarray(env.action_space.sample())[None]).success is not None
-
-
-def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
-    """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
-    slots = min(len(train), _COMPARED_STARTS)
-    with _failures_explained(config, "reset"):
-        env = make_env(config, slots)
-        starts = env.reset(np.arange(slots), train.contexts[:slots], np.zeros(slots, dtype=np.uint64))
-    return slots > 1 and alike(starts)
-
-
-@contextlib.contextmanager
-def _failures_explained(config: RunConfig, what: str) -> Iterator[None]:
-    """Somebody else's environment may raise anything."""
-    try:
-        yield
-    except ConfigError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise ConfigError(f"env.id {config.env.id!r}: {what} failed: {type(error).__name__}: {error}") from error
 
 
 @dataclass
@@ -671,7 +559,7 @@ class Training:
         run, cluster, data = self._run, self._cluster, checkpoint.data["run"]
         order, positions = data["walk"]
         run.walk = Walk(order, tuple(positions), self._unfinished(checkpoint) if positions else ())
-        _load_learner(self.learner, checkpoint)
+        load_learner(self.learner, checkpoint)
         run.segments = list(checkpoint.segments)
         for segment in run.segments:
             self.learner.remember(self._writer.read_segment(segment), segment.first)
@@ -683,20 +571,20 @@ class Training:
         arrays = checkpoint.arrays
         run.sizes = arrays.get("sizes")
         state = decode_state(
-            self._curriculum.state_type, _under("curriculum/", arrays), checkpoint.data["curriculum"]
+            self._curriculum.state_type, under("curriculum/", arrays), checkpoint.data["curriculum"]
         )  # fmt: skip
         selection = self._curriculum.selection(state)
         self._know_selection(selection)
         run.rounds_left = data["rounds_left"]
         run.state, run.selection = cluster.put(state), cluster.put(selection)
         run.values = cluster.put(arrays["values"])
-        run.scored = _under("scored/", arrays)
-        seen = _under("seen/", arrays)
+        run.scored = under("scored/", arrays)
+        seen = under("seen/", arrays)
         run.seen = [Episodes(**seen)] if seen else []
         if self.ensemble is not None:
-            self.ensemble.load(_under("ensemble/", arrays))
+            self.ensemble.load(under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
-        if (acted := _under("acted/", arrays)) and isinstance(self.learner, Learner):
+        if (acted := under("acted/", arrays)) and isinstance(self.learner, Learner):
             run.acted = acted
             run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
@@ -705,116 +593,13 @@ class Training:
         """The episodes that run. Raises SpaceDistError if a checkpoint's cannot be this run's."""
         setup, env = self._setup, make_env(self._config)
         return unstacked(
-            _under("unfinished/", checkpoint.arrays), shards=setup.shards, slots=setup.slots,
+            under("unfinished/", checkpoint.arrays), shards=setup.shards, slots=setup.slots,
             features=len(setup.train.names), horizon=env.horizon, action_shape=env.action_space.shape or (),
         )  # fmt: skip
 
     def _show(self) -> None:
         self.progress.steps = self._run.steps
         self._observe(self.progress)
-
-
-def make_env(config: RunConfig, n_slots: int = 1) -> BatchedEnv:
-    """A config's environment, as its policy sees it."""
-    env = config.env
-    return make_batched(env.id, n_slots, context_visible=env.context_visible, kwargs=env.kwargs)
-
-
-def total_steps(config: RunConfig, horizon: int) -> int:
-    """Environment steps of a whole run: those of the rounds that fit.
-
-    The budget, where rounds end by episodes or probes come between them.
-    """
-    if config.n_episodes is not None or config.curriculum.probes:
-        return config.budget.steps
-    return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
-
-
-def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
-    """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
-    if config.engine != "auto":
-        return config
-    stock = getattr(config.learner, "update", "stock") == "stock"
-    env, engine = make_env(config), "population" if can_share and stock and not config.rollout.overlap else "single"
-    try:
-        refuse_population(config.learner, env.observation_space, env.action_space)
-    except ConfigError:
-        engine = "single"
-    return config.model_copy(update={"engine": engine})
-
-
-def stack_of(config: RunConfig) -> str:
-    """`(16 hex digits)` equal for runs that may be members of one population; empty for those of no population."""
-    if config.engine != "population":
-        return ""
-    env = make_env(config)
-    key = (
-        config.env.model_dump_json(),
-        config.device,
-        stack_key(config.learner, env.observation_space, env.action_space),
-    )
-    return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
-
-
-def memory_of(config: RunConfig) -> int:
-    """About what a run takes of the memory of the process that it shares, in MB; 0 for a run that works alone."""
-    if config.engine != "population" or not isinstance(config.learner, PPOConfig | TRPOConfig):
-        return 0
-    env = make_env(config)
-    each = member_bytes(config.learner, env.observation_space, env.action_space, config.device)
-    return -(-config.members * each >> 20)
-
-
-def learner_of(config: RunConfig) -> Learner | CoupledLearner:
-    """A config's learner with its initial networks."""
-    if config.members == 1:
-        return _learner_of(config, config.seed)
-    members = [_learner_of(config, int(seed)) for seed in member_seeds(config.seed, config.members)]
-    return CoupledLearner([member for member in members if isinstance(member, PopulationLearner)])
-
-
-def _learner_of(config: RunConfig, seed: int) -> Learner:
-    env = make_env(config)
-    return make_learner(
-        config.learner, env.observation_space, env.action_space,
-        seed=seed, n_slots=config.rollout.shards * config.rollout.slots,
-        slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
-        population=config.engine == "population", device=config.device,
-    )  # fmt: skip
-
-
-def ensemble_of(config: RunConfig) -> Ensemble | None:
-    """The ensemble of value functions that a config's curriculum asks for, if it does, with its initial networks."""
-    env = make_env(config)
-    return make_ensemble(config, env.observation_space, env.context_bounds.names)
-
-
-def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy | Several:
-    """The policy, or policies, that a checkpoint holds."""
-    learner = learner_of(config)
-    _load_learner(learner, checkpoint)
-    return learner.policy(checkpoint.round)
-
-
-def model_of(learner: Learner | CoupledLearner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """A trained policy as arrays and a description: layer by layer, or as torch's state where NumPy cannot act."""
-    policy = learner.policy(version)
-    if isinstance(policy, MlpPolicy):
-        return to_arrays(policy)
-    arrays = learner.scored()
-    first = learner.members[0] if isinstance(learner, CoupledLearner) else learner
-    return arrays, {
-        "format": 2, "version": version, "policy": "torch", "class": str(type(first.model.policy)),
-        "shapes": {name: list(array.shape) for name, array in arrays.items()},
-    }  # fmt: skip
-
-
-def _load_learner(learner: Learner | CoupledLearner, checkpoint: Checkpoint) -> None:
-    learner.load(_under("learner/", checkpoint.arrays), checkpoint.data["learner"])
-
-
-def _under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int:

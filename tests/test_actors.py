@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from space_dist.arithmetic import digest, scipy_probes
+from space_dist.building import learner_of, make_setup
 from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import METRICS, Ledger
-from space_dist.training import learner_of, make_setup
 from tests.patience import PATIENCE
 from tests.test_distributed import cluster_class, config, reference, results  # noqa: F401
 from tests.test_learners import config_for, learner_section

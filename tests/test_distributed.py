@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist.building import make_setup
 from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import CURRICULUM, METRICS
 from space_dist.place import private_ray
-from space_dist.training import make_setup
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent

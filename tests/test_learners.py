@@ -14,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.sac.policies import SACPolicy  # noqa: F401 - named by import path
 
 from space_dist import config as configs
+from space_dist.building import learner_of, make_setup
 from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig
 from space_dist.envs.observations import Observations, rows
@@ -27,7 +28,6 @@ from space_dist.ledger import CURRICULUM, FORMAT, METRICS, Ledger, RunWriter, de
 from space_dist.policy import MlpPolicy
 from space_dist.report import build_report, load_run
 from space_dist.rollout import Worker
-from space_dist.training import learner_of, make_setup
 from space_dist.walk import Walk
 from tests.test_learner import hand_made
 

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist import rollout
+from space_dist.building import learner_of, make_setup, memory_of
 from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
@@ -25,7 +26,6 @@ from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.policy import members_of
 from space_dist.population import advance, member
 from space_dist.rollout import Shard, Worker
-from space_dist.training import learner_of, make_setup, memory_of
 from space_dist.walk import Walk
 from tests.grids import ROOT
 from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results

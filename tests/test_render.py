@@ -16,6 +16,7 @@ from PIL import Image, ImageSequence
 
 from space_dist import cli
 from space_dist import config as configs
+from space_dist.building import learner_of, make_setup
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
@@ -26,7 +27,6 @@ from space_dist.policy import MlpPolicy, to_arrays
 from space_dist.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.rollout import Worker
 from space_dist.tracking import runs, sync
-from space_dist.training import learner_of, make_setup
 from tests.test_report import finished_run, written
 
 BLUE, GREEN, RED = (0, 114, 178), (0, 158, 115), (213, 94, 0)

@@ -20,6 +20,7 @@ from scipy import stats
 from sklearn.mixture import GaussianMixture
 
 from space_dist import config as configs
+from space_dist.building import make_setup
 from space_dist.cluster import make_curriculum
 from space_dist.curricula import (
     Curriculum,
@@ -49,7 +50,6 @@ from space_dist.policy import EnsemblePolicy, Statistics
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout import Setup, Shard, Worker
 from space_dist.seeding import Purpose, generator
-from space_dist.training import make_setup
 from space_dist.walk import Walk
 from tests.tiny_env import Line
 

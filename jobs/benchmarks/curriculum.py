@@ -15,11 +15,11 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import duration, median, median_cpu
 from space_dist import config as configs
+from space_dist.building import learner_of, make_setup
 from space_dist.cluster import Central, Evidence, InProcess
 from space_dist.curricula import SetState
 from space_dist.instances import sample
 from space_dist.place import private_ray
-from space_dist.training import learner_of, make_setup
 from space_dist.walk import Walk
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -96,8 +96,8 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
+    from space_dist.building import make_setup
     from space_dist.launch import read_instances
-    from space_dist.training import make_setup
 
     run = configs.load(config, list(overrides or []))
     with about(str(config)):

@@ -73,6 +73,7 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
+    from space_dist.building import make_env
     from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of, stored_config
@@ -81,7 +82,6 @@ def evaluate(
     from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
-    from space_dist.training import make_env
 
     ledger = Ledger(run)
     status = ledger.status()
@@ -127,11 +127,11 @@ def explain(
     iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
 ) -> None:
     """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 12)."""
+    from space_dist.building import make_env
     from space_dist.instances import read_csv
     from space_dist.launch import stored_config
     from space_dist.ledger import Ledger
     from space_dist.report.decisions import explain as explain_decision
-    from space_dist.training import make_env
 
     ledger = Ledger(run)
     ledger.status()
