@@ -32,7 +32,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from space_dist.building import ensemble_of, learner_of, load_learner, make_env, model_of, total_steps, under
+from space_dist.building import ensemble_of, learner_of, load_learner, model_of, total_steps, under
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
 from space_dist.config import GrowingConfig, RunConfig
 from space_dist.curricula import GENERATED, Episodes, Selection, decode_state, encode_state
@@ -150,11 +150,11 @@ class Training:
     ) -> None:
         self._config, self._setup, self._cluster, self._writer = config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
-        self._horizon = make_env(config).horizon
+        spec, self._horizon = setup.spec, setup.spec.horizon
         self._total_steps = total_steps(config, self._horizon)
-        self.learner = learner_of(config)
-        self.ensemble = ensemble_of(config)
-        self._curriculum = make_curriculum(config, setup.train)
+        self.learner = learner_of(config, spec)
+        self.ensemble = ensemble_of(config, spec)
+        self._curriculum = make_curriculum(config, setup.train, spec.context_bounds)
         self._run = _Run()
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
@@ -213,7 +213,7 @@ class Training:
         policy = cluster.put(self.learner.policy(0))
         first = cluster.begin(cluster.start_values(policy))
         self._adopt(first)
-        bounds = make_env(self._config).context_bounds
+        bounds = self._setup.spec.context_bounds
         if len(self._setup.train) > MOST_VALUED:
             log.info("%d instances: above %d, %s is not written", len(self._setup.train), MOST_VALUED, VALUES)
         self._keep_values({"iteration": 0, "low": bounds.low.tolist(), "high": bounds.high.tolist()}, first)
@@ -228,7 +228,7 @@ class Training:
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
         (seeing,) = members_of(self.learner.policy(0))
-        policy = blind(seeing, self._setup.make_env(1).action_space, PROBE)
+        policy = blind(seeing, self._setup.spec.action_space, PROBE)
         handles = cluster.collect(
             cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=PROBE, steps=0, version=selection.version
         )  # fmt: skip
@@ -591,10 +591,10 @@ class Training:
 
     def _unfinished(self, checkpoint: Checkpoint) -> tuple[Unfinished, ...]:
         """The episodes that run. Raises SpaceDistError if a checkpoint's cannot be this run's."""
-        setup, env = self._setup, make_env(self._config)
+        setup, spec = self._setup, self._setup.spec
         return unstacked(
             under("unfinished/", checkpoint.arrays), shards=setup.shards, slots=setup.slots,
-            features=len(setup.train.names), horizon=env.horizon, action_shape=env.action_space.shape or (),
+            features=len(setup.train.names), horizon=spec.horizon, action_shape=spec.action_space.shape or (),
         )  # fmt: skip
 
     def _show(self) -> None:

@@ -73,7 +73,7 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
-    from space_dist.building import make_env
+    from space_dist.building import spec_of
     from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of, stored_config
@@ -87,19 +87,22 @@ def evaluate(
     status = ledger.status()
     state = "abandoned" if ledger.abandoned(status) else status.state
     config = stored_config(ledger)
-    policies = members_of(policy_of(ledger))
-    chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
-    env = make_env(config, len(chosen))
+    spec = spec_of(config)
+    policies = members_of(policy_of(ledger, spec))
+    chosen = read_csv(instances, spec.context_bounds, config.curriculum.columns, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    with exits_refused():
+    optimum = None
+    with exits_refused(), spec.opened(len(chosen)) as env:
         outcomes = [evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])[0]
                     for policy in policies]  # fmt: skip
+        if isinstance(world := unwrapped(env), KnowsOptimum):
+            optimum = world.optimal_returns(chosen.contexts)
     names = {"return": "returns", "discounted_return": "discounted_returns", "length": "lengths", "success": "success"}
     columns = {  # over all policies, where the run trains several
         column: np.mean([getattr(outcome, name) for outcome in outcomes], axis=0) for column, name in names.items()
     }
-    if isinstance(world := unwrapped(env), KnowsOptimum):
-        columns["optimal_return"] = world.optimal_returns(chosen.contexts)
+    if optimum is not None:
+        columns["optimal_return"] = optimum
     means = {name: None if np.isnan(values).all() else float(np.mean(values)) for name, values in columns.items()}
     if "optimal_return" in columns:  # a share of sums: no single episode's return need be positive
         means["share_of_optimum"] = float(columns["return"].sum() / columns["optimal_return"].sum())
@@ -127,7 +130,7 @@ def explain(
     iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
 ) -> None:
     """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 12)."""
-    from space_dist.building import make_env
+    from space_dist.building import spec_of
     from space_dist.instances import read_csv
     from space_dist.launch import stored_config
     from space_dist.ledger import Ledger
@@ -137,8 +140,9 @@ def explain(
     ledger.status()
     config = stored_config(ledger)
     ledger.read(ledger.instances("train"))
-    train = read_csv(ledger.instances("train"), make_env(config).context_bounds, config.curriculum.columns)
-    for line in explain_decision(ledger, config, train, iteration):
+    bounds = spec_of(config).context_bounds
+    train = read_csv(ledger.instances("train"), bounds, config.curriculum.columns)
+    for line in explain_decision(ledger, config, bounds, train, iteration):
         print(line)
     delivered()
 
