@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from typing import Any
 
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
 from space_dist.learner import (
-    Arrays,
     CoupledLearner,
     Ensemble,
     Learner,
@@ -187,9 +185,4 @@ def model_of(learner: Learner | CoupledLearner, version: int) -> tuple[dict[str,
 
 def load_learner(learner: Learner | CoupledLearner, checkpoint: Checkpoint) -> None:
     """Bring a learner to where it was when a checkpoint was written."""
-    learner.load(under("learner/", checkpoint.arrays), checkpoint.data["learner"])
-
-
-def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """The arrays whose names begin with `prefix`, without it."""
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+    learner.load(checkpoint.under("learner/"), checkpoint.data["learner"])
