@@ -28,10 +28,6 @@ class _Form:
     pack: Callable[[str, Any], tuple[dict[str, Any], Arrays]]
     unpack: Callable[[str, Checkpoint, Setup], Any]
 
-    def stored(self, default: Callable[[], Any]) -> Any:
-        """A field that is stored like this."""
-        return field(default_factory=default, metadata={"form": self})
-
 
 def _under(folder: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     return {f"{folder}/{name}": array for name, array in arrays.items()}
@@ -85,22 +81,22 @@ class RunState:
     sizes: (slots,) sums of |GAE| over running episodes, where anyone asks.
     """
 
-    scored: Arrays = _ARRAYS.stored(dict)
-    acted: Arrays = _ARRAYS.stored(dict)
-    seen: list[Episodes] = _EPISODES.stored(list)
+    scored: Arrays = field(default_factory=dict, metadata={"form": _ARRAYS})
+    acted: Arrays = field(default_factory=dict, metadata={"form": _ARRAYS})
+    seen: list[Episodes] = field(default_factory=list, metadata={"form": _EPISODES})
     round: int = 0
     steps: int = 0
     episodes: int = 0
     iteration: int = 1
     rounds_left: int | None = None
     version: int = 0
-    walk: Walk = _WALK.stored(lambda: Walk(-1, ()))
+    walk: Walk = field(default_factory=lambda: Walk(-1, ()), metadata={"form": _WALK})
     rows: int = 0
     evaluated_at: int = -1
     rollouts: list[dict[str, float]] = field(default_factory=list)
     updates: list[dict[str, float]] = field(default_factory=list)
     gradient_steps: int = 0
-    sizes: NDArray[np.float64] | None = _ARRAY.stored(lambda: None)
+    sizes: NDArray[np.float64] | None = field(default=None, metadata={"form": _ARRAY})
 
     def save(self) -> tuple[dict[str, Any], Arrays]:
         """What `restored` makes this of again: a checkpoint's `run` data, and arrays."""

@@ -45,9 +45,7 @@ class Makers:
     bounds: of the contexts of the environment.
     """
 
-    def __init__(
-        self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds
-    ) -> None:
+    def __init__(self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds) -> None:
         self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
 
     def make(self, settings: CurriculumConfig) -> Curriculum:
