@@ -122,3 +122,14 @@ def test_actors_are_compared_by_all_that_they_compute_with(
                 distributed.refuse_other_arithmetic(0, {**found, part: "0"})
     monkeypatch.setattr(distributed, "scipy_probes", lambda: iter([("qr", np.zeros(1))]))
     assert distributed.computed(["scipy"]) != {"scipy": digest(scipy_probes())}
+
+
+def test_actors_close_their_environments_where_a_run_ends(tmp_path: Path) -> None:
+    noted = tmp_path / "noted"
+    noted.mkdir()
+    env = {"id": "tests.tiny_env:make_noting", "kwargs": {"folder": str(noted)}}
+    there = config_for(tmp_path, learner_section("ppo"), env=env, resources={"workers": 2})
+    launch(there, tmp_path / "run", resume=True, stop=StopRequests())
+    files = [path.name for path in noted.iterdir()]
+    assert len({name.partition("-")[0] for name in files}) == 3  # processes: two actors, and the driver, to look at one
+    assert [name for name in files if not name.endswith(".closed")] == []
