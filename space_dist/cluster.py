@@ -14,9 +14,8 @@ import numpy as np
 
 from space_dist.config import GrowingConfig, RunConfig
 from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, Selection, State
-from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.instances import InstanceSet
+from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Worker, joined
 from space_dist.walk import Walk
 
@@ -98,8 +97,8 @@ class Cluster(Protocol):
 class Central:
     """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state."""
 
-    def __init__(self, config: RunConfig, train: InstanceSet) -> None:
-        self.curriculum = make_curriculum(config, train)
+    def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
+        self.curriculum = make_curriculum(config, train, bounds)
         self._from_zero = isinstance(config.curriculum, GrowingConfig) and config.curriculum.v0 == "zero"
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
@@ -154,7 +153,8 @@ class InProcess:
     """The cluster's twin without Ray: everything at once, here. Same bits."""
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._setup, self._worker, self._central = setup, Worker(setup), Central(config, setup.train)
+        self._setup, self._central = setup, Central(config, setup.train, setup.spec.context_bounds)
+        self._worker = Worker(setup)
 
     def put(self, value: object) -> Handle:
         """The value itself."""
@@ -199,16 +199,22 @@ class InProcess:
         """The values themselves."""
         return list(handles)
 
+    def close(self) -> None:
+        """Close the environments."""
+        self._worker.close()
 
-def make_curriculum(config: RunConfig, train: InstanceSet) -> Curriculum:
-    """The curriculum a config asks for. Raises ConfigError if it asks for instances or features that are not there."""
+
+def make_curriculum(config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> Curriculum:
+    """The curriculum a config asks for. Raises ConfigError if it asks for instances or features that are not there.
+
+    bounds: of the contexts of the config's environment.
+    """
     from space_dist.curricula.configured import Makers  # SciPy's optimisers, which rollout actors never need
 
-    env, rollout = config.env, config.rollout
+    rollout = config.rollout
     return Makers(
-        train, source=str(config.instances.train), seed=config.seed,
+        train, source=str(config.instances.train), seed=config.seed, bounds=bounds,
         draws=Draws(config.n_episodes or config.learner.n_steps * config.members, rollout.shards * config.members),
-        bounds=lambda: make_batched(env.id, 1, context_visible=False, kwargs=env.kwargs).context_bounds,
     ).make(config.curriculum)  # fmt: skip
 
 

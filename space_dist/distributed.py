@@ -66,6 +66,7 @@ _ATTEMPTS = 6  # at one call, or at one actor's start, before something must be 
 _LOOK_SECONDS = 0.2  # between two looks for what died or is late
 _RESCHEDULING_SECONDS = 5.0  # that Ray gets to find other room for a lost node's actors
 _REMEMBERED = 101  # durations per kind of call, whose median says what is late
+_CLOSING_SECONDS = 5.0  # that actors get to close their environments
 _CENTRAL = -1
 _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 
@@ -80,7 +81,7 @@ def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[st
     else:
         from space_dist.learner import is_mlp  # torch, which actors of such policies never import
 
-        also = {"torch": not is_mlp(config.learner, setup.make_env(1).observation_space),
+        also = {"torch": not is_mlp(config.learner, setup.spec.observation_space),
                 "pybullet": config.env.id in BULLET_IDS}  # fmt: skip
     return ("numpy", *(name for name, used in also.items() if used))
 
@@ -138,7 +139,7 @@ class CurriculumActor(_Timed, Central):
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
         threadpool_limits(limits=1)
-        super().__init__(config, setup.train)
+        super().__init__(config, setup.train, setup.spec.context_bounds)
 
 
 @dataclass(eq=False)
@@ -223,6 +224,8 @@ class RayCluster:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if kind is None or issubclass(kind, Interrupted):
+            self._close_environments()
         with contextlib.suppress(RayError):
             for actor in self._actors.values():
                 ray.kill(actor)
@@ -423,6 +426,14 @@ class RayCluster:
             )
             parts = self._computing[seat == _CENTRAL]
             self._starting[seat] = (self._actors[seat].ready.remote(parts), time.monotonic())
+
+    def _close_environments(self) -> None:
+        """Have actors close their environments: what these hold outside of their process would outlive it."""
+        with contextlib.suppress(RayError):
+            asked = [actor.close.remote() for seat, actor in self._actors.items()
+                     if seat != _CENTRAL and seat not in self._starting]  # fmt: skip
+            if asked:
+                ray.wait(asked, num_returns=len(asked), timeout=_CLOSING_SECONDS, fetch_local=False)
 
     def _replace(self, seats: Iterable[int]) -> None:
         for seat in seats:

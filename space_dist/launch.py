@@ -25,9 +25,11 @@ from threadpoolctl import threadpool_limits
 
 from space_dist import arithmetic
 from space_dist import config as configs
+from space_dist.building import make_setup, policy_in, resolved, spec_of
 from space_dist.cluster import Cluster, InProcess
 from space_dist.config import PPOConfig, RunConfig
 from space_dist.envs import BULLET_IDS
+from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import (
     ConfigError,
     Interrupted,
@@ -40,7 +42,7 @@ from space_dist.errors import (
 )
 from space_dist.files import LogFile, appending, in_words
 from space_dist.importing import PYTHON
-from space_dist.instances import InstanceSet, read_csv, refuse_overlap
+from space_dist.instances import ContextBounds, InstanceSet, read_csv, refuse_overlap
 from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_machine, torch_probes
 from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
@@ -49,7 +51,7 @@ from space_dist.policy import Policy, Several, from_arrays
 from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
 from space_dist.tracking.pusher import ended_within
-from space_dist.training import Progress, Training, make_env, make_setup, policy_in, resolved
+from space_dist.training import Progress, Training
 
 log = logging.getLogger("space_dist")
 
@@ -65,9 +67,11 @@ class Outcome:
     tracking_warning: str | None = None
 
 
-def read_instances(config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
-    """The training and test instances of a config. Raises ConfigError for a bad file, or one that shares a context."""
-    bounds = make_env(config).context_bounds
+def read_instances(config: RunConfig, bounds: ContextBounds) -> tuple[InstanceSet, InstanceSet]:
+    """The training and test instances of a config, whose contexts lie in `bounds`.
+
+    Raises ConfigError for a bad file, or one that shares a context.
+    """
     columns = config.curriculum.columns
     with about("instances.train"):
         train = read_csv(config.instances.train, bounds, columns)
@@ -146,9 +150,10 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 @contextlib.contextmanager
 def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
-    ledger, config = Ledger(folder), resolved(config)
-    train, test = read_instances(config)
-    setup = make_setup(config, train, test)
+    ledger, spec = Ledger(folder), spec_of(config)
+    config = resolved(config, spec)
+    train, test = read_instances(config, spec.context_bounds)
+    setup = make_setup(config, spec, train, test)
     refuse_machine(config)
     _refuse_other_arithmetic(config)
     if ledger.exists() and not resume:
@@ -294,7 +299,7 @@ def _refuse_other_run(
         return
     try:  # the stored config decides as this version reads it, if it is known to be what the run wrote
         stored = configs.load(ledger.config) if before is None else stored_config(ledger)
-        train, test = read_instances(stored)
+        train, test = read_instances(stored, spec_of(stored).context_bounds)
     except LedgerError as error:
         raise ConfigError(
             f"{ledger.folder} holds a run of another configuration; which cannot be told: {error}"
@@ -327,10 +332,10 @@ def _self_contained(config: RunConfig) -> RunConfig:
     )
 
 
-def policy_of(ledger: Ledger) -> Policy | Several:
+def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
     """The policy, or policies, of a finished run, or those of an unfinished one's last checkpoint.
 
-    Raises LedgerError where there is none, and where it is damaged.
+    spec: of the run's environment. Raises LedgerError where there is none, and where it is damaged.
     """
     model = (ledger.model_arrays, ledger.model_description)
     if ledger.status().state == "done" and all(path.exists() for path in model):
@@ -345,13 +350,14 @@ def policy_of(ledger: Ledger) -> Policy | Several:
     checkpoint = ledger.last_checkpoint()
     if checkpoint is None:
         raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
-    return policy_in(checkpoint, stored_config(ledger))
+    return policy_in(checkpoint, stored_config(ledger), spec)
 
 
 @contextlib.contextmanager
 def _cluster(course: Course) -> Iterator[Cluster]:
     if course.config.resources.workers == 0:
-        yield InProcess(course.config, course.setup)
+        with contextlib.closing(InProcess(course.config, course.setup)) as here:
+            yield here
         return
     if course.config.resources.address == "local":
         private_ray()

@@ -106,6 +106,10 @@ class Checkpoint:
     segments: tuple[Segment, ...] = ()
     format: int = FORMAT
 
+    def under(self, prefix: str) -> dict[str, NDArray[Any]]:
+        """The arrays whose names begin with `prefix`, without it."""
+        return {name.removeprefix(prefix): array for name, array in self.arrays.items() if name.startswith(prefix)}
+
 
 @dataclasses.dataclass(frozen=True)
 class Segment:

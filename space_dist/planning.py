@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from space_dist import config as configs
+from space_dist.building import make_setup, memory_of, resolved, spec_of, stack_of, total_steps
 from space_dist.config import RunConfig
+from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, about
 from space_dist.grid import freeze
-from space_dist.instances import InstanceSet
+from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.launch import read_instances
 from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
 from space_dist.place import absolute_uri
 from space_dist.provenance import code_digest, git_state, source_digest
-from space_dist.training import make_env, make_setup, memory_of, resolved, stack_of, total_steps
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,12 @@ def plan(path: Path, root: Path) -> Plan:
     config, points = load_grid(path)
     grid = Grid(root.absolute() / config.name)
     files = _InstanceFiles()
+    specs: dict[str, EnvironmentSpec] = {}  # by the section of a config: an environment is looked at once
     cells: dict[str, Cell] = {}
     steps = 0
     for point, data in points:
         label = label_of(point, config.axes())
-        cell, run_steps = _cell(config, point, label, data, f"{path}, cell {label!r}", files)
+        cell, run_steps = _cell(config, point, label, data, f"{path}, cell {label!r}", files, specs)
         if cell.id in cells:
             raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
         cells[cell.id] = cell
@@ -71,11 +73,10 @@ class _InstanceFiles:
         self._read: dict[tuple[object, ...], tuple[InstanceSet, InstanceSet]] = {}
         self._names: dict[int, str] = {}
 
-    def sets(self, config: RunConfig) -> tuple[InstanceSet, InstanceSet]:
-        bounds = make_env(config).context_bounds
+    def sets(self, config: RunConfig, bounds: ContextBounds) -> tuple[InstanceSet, InstanceSet]:
         key = (config.instances.train, config.instances.test, bounds)
         if key not in self._read:
-            self._read[key] = read_instances(config)
+            self._read[key] = read_instances(config, bounds)
         return self._read[key]
 
     def name(self, instances: InstanceSet) -> str:
@@ -87,30 +88,33 @@ class _InstanceFiles:
 
 
 def _cell(
-    grid: GridConfig, point: dict[str, Any], label: str, data: dict[str, Any], where: str, files: _InstanceFiles
-) -> tuple[Cell, int]:
+    grid: GridConfig, point: dict[str, Any], label: str, data: dict[str, Any], where: str, files: _InstanceFiles,
+    specs: dict[str, EnvironmentSpec],
+) -> tuple[Cell, int]:  # fmt: skip
     """A cell, and the environment steps of each of its runs."""
     for key in ("tracking", "resources", "seed"):  # the grid's own
         data.pop(key, None)
     name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
     config = configs.parse({**data, "name": name}, where)
     with about(where):
-        config = resolved(config, can_share=grid.resources.workers == 0)
+        section = config.env.model_dump_json()
+        spec = specs[section] = specs.get(section) or spec_of(config)
+        config = resolved(config, spec, can_share=grid.resources.workers == 0)
         if config.engine == "population" and grid.resources.workers:
             raise ConfigError(
                 f"engine: population with resources.workers: {grid.resources.workers}: runs that share a process have "
                 "no rollout actors of their own; use workers: 0, or engine: single"
             )
-        train, test = files.sets(config)
-        make_setup(config, train, test)
+        train, test = files.sets(config, spec.context_bounds)
+        make_setup(config, spec, train, test)
         paths = [path for path in (config.env.id, getattr(config.learner, "policy", "")) if ":" in path]
         sources = {path: source_digest(path) for path in paths}
     identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
     data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
     data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
                              (("train", train), ("test", test))}  # fmt: skip
-    steps = total_steps(config, make_env(config).horizon)
-    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config), memory_of(config)), steps
+    steps = total_steps(config, spec.horizon)
+    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config, spec), memory_of(config, spec)), steps
 
 
 def _distinct(cells: Any) -> tuple[Cell, ...]:

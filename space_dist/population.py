@@ -20,8 +20,7 @@ import numpy as np
 
 from space_dist.cluster import Handle, InProcess
 from space_dist.config import RunConfig
-from space_dist.envs import BatchedEnv
-from space_dist.envs.interface import Closable
+from space_dist.envs import BatchedEnv, close
 from space_dist.errors import SpaceDistError, exits_refused
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, begun, speaking
@@ -38,7 +37,8 @@ def member(config: RunConfig, folder: Path, *, stop: StopRequests) -> Work[Outco
     """One run of a population, to its end or from where it stopped; raises as `launch` does."""
     with begun(config, folder, resume=True, stop=StopRequests(stop)) as course:
         if not course.outcome.already_done:
-            yield from course.training(_Promising(config, course.setup, folder)).work()
+            with contextlib.closing(_Promising(config, course.setup, folder)) as cluster:
+                yield from course.training(cluster).work()
     return course.finished()
 
 
@@ -142,7 +142,7 @@ class _Promise:
     def batch(self) -> Hashable:
         """Equal for what can be computed at once."""
         setup = self.setup
-        env = (setup.env_id, json.dumps(dict(setup.env_kwargs), sort_keys=True), setup.context_visible)
+        env = (setup.spec.env_id, json.dumps(dict(setup.spec.kwargs), sort_keys=True), setup.spec.context_visible)
         if isinstance(self.work, Rollout):
             return ("collect", *env, setup.slots, setup.slot_length)
         return ("measure", *env, len(self.work), self.work.random is None)
@@ -159,6 +159,7 @@ class _Promising(InProcess):
     def __init__(self, config: RunConfig, setup: Setup, folder: Path) -> None:
         super().__init__(config, setup)
         self._folder = str(folder)
+        self._worker.close()  # collecting and measuring are the workshop's; that one can be made is known by now
 
     def collect(
         self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
@@ -221,8 +222,8 @@ class _Workshop:
             values = collect(self._stage(key, promised), rollouts, length=setup.slot_length)
         else:
             env = self._env(key, promised)
+            self._keep_spare(key, env)  # before it may fail, and is closed with the others
             values = evaluate(env, [work for work in works if isinstance(work, Trial)])
-            self._keep_spare(key, env)
         for promise, value in zip(promised, values, strict=True):
             promise.value = value
 
@@ -252,7 +253,7 @@ class _Workshop:
     def _env(self, key: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:
         """A spare one, or a new one."""
         if key not in self._spare:
-            return promised[0].setup.make_env(sum(promise.slots for promise in promised))
+            return promised[0].setup.spec.make(sum(promise.slots for promise in promised))
         env = self._spare[key].pop()
         if not self._spare[key]:
             del self._spare[key]
@@ -268,9 +269,7 @@ class _Workshop:
         env = self._spare[key].pop(0)
         if not self._spare[key]:
             del self._spare[key]
-        if isinstance(env, Closable):
-            with contextlib.suppress(Exception):
-                env.close()
+        close(env)
 
 
 def _parts(promised: Sequence[_Promise]) -> Iterator[Sequence[_Promise]]:

@@ -6,6 +6,7 @@ PointMass, CartPole and Maze are drawn here from their contexts and observations
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -25,10 +26,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from space_dist import config as configs
 from space_dist.config import RunConfig
-from space_dist.envs import BatchedEnv, Drawable, KnowsOptimum, make_batched, takes_argument, unwrapped
+from space_dist.envs import Drawable, KnowsOptimum, close, takes_argument, unwrapped
 from space_dist.envs.cartpole import ANGLE_LIMIT, X_LIMIT
 from space_dist.envs.observations import take
 from space_dist.envs.pointmass import GOAL, POSITION_LIMIT, SUCCESS_DISTANCE
+from space_dist.envs.spec import read_spec
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.files import atomic_write
 from space_dist.instances import InstanceSet, read_csv
@@ -100,11 +102,12 @@ class Gallery:
 
     def __init__(self, ledger: Ledger) -> None:
         self._config: RunConfig = configs.load(ledger.config)
-        self._policy: Policy = members_of(policy_of(ledger))[0]  # the first, where the run trains several
-        self._env = self._make()
-        bounds = self._env.context_bounds
+        env = self._config.env
+        picture = {"render_mode": "rgb_array"} if takes_argument(env.id, "render_mode") else {}
+        spec = read_spec(env.id, context_visible=env.context_visible, kwargs={**env.kwargs, **picture})
+        self._policy: Policy = members_of(policy_of(ledger, spec))[0]  # the first, where the run trains several
         self._sets: dict[Split, InstanceSet] = {
-            split: read_csv(ledger.instances(split), bounds) for split in _SPLITS
+            split: read_csv(ledger.instances(split), spec.context_bounds) for split in _SPLITS
         }  # fmt: skip
         self._seeds = {
             split: episode_seeds(
@@ -115,6 +118,11 @@ class Gallery:
         }  # fmt: skip
         self._scene = _SCENES.get(self._config.env.id)
         self.name = f"{self._config.name}, seed {self._config.seed}"
+        self._env = spec.make(1)
+
+    def close(self) -> None:
+        """Close the environment."""
+        close(self._env)
 
     def find(self, ids: Sequence[int]) -> list[tuple[Split, int]]:
         """The set that holds each id, and its place there. Raises ConfigError for ids that are in neither or both."""
@@ -183,11 +191,6 @@ class Gallery:
         atomic_write(path, buffer.getvalue())
         return [path]
 
-    def _make(self) -> BatchedEnv:
-        env = self._config.env
-        picture = {"render_mode": "rgb_array"} if takes_argument(env.id, "render_mode") else {}
-        return make_batched(env.id, 1, context_visible=env.context_visible, kwargs={**env.kwargs, **picture})
-
     def _play(
         self, split: Split, place: int, frames: dict[int, Frame] | None = None, every: int = 1
     ) -> Episode:  # fmt: skip
@@ -228,18 +231,19 @@ def draw_run(ledger: Ledger, folder: Path, ids: Sequence[int] | None = None) -> 
     Returns (file, what happened in it). Raises ConfigError for unknown ids or an environment that cannot be drawn,
     LedgerError if there is no policy or a file cannot be written.
     """
-    gallery = Gallery(ledger)
-    chosen = gallery.some() if ids is None else gallery.find(ids)
-    written = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for split, place in chosen:
-            path, episode = gallery.gif(split, place, folder)
-            written.append((path, f"{split} instance {episode.id}: {episode.outcome}, {episode.length} steps"))
-        for split in _SPLITS:
-            written += [(path, f"trajectories on {split} instances") for path in gallery.trajectories(split, folder)]
-    except OSError as error:
-        raise LedgerError(f"cannot write to {folder}: {error.strerror or error}") from None
+    with contextlib.closing(Gallery(ledger)) as gallery:
+        chosen = gallery.some() if ids is None else gallery.find(ids)
+        written = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for split, place in chosen:
+                path, episode = gallery.gif(split, place, folder)
+                written.append((path, f"{split} instance {episode.id}: {episode.outcome}, {episode.length} steps"))
+            for split in _SPLITS:
+                pictures = gallery.trajectories(split, folder)
+                written += [(path, f"trajectories on {split} instances") for path in pictures]
+        except OSError as error:
+            raise LedgerError(f"cannot write to {folder}: {error.strerror or error}") from None
     return written
 
 

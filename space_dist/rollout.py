@@ -13,16 +13,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.curricula import Selection
-from space_dist.envs import BatchedEnv, Observations, make_batched
+from space_dist.envs import BatchedEnv, Observations, close
 from space_dist.envs.observations import allocate, concatenate, distinct, put, rows, take
+from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.policy import Noise, Policy, Several, Valuing, can_act_side_by_side, members_of, side_by_side
@@ -161,8 +162,7 @@ class Trial:
 class Setup:
     """Everything a worker must know to compute any piece of a run's work."""
 
-    env_id: str
-    context_visible: bool
+    spec: EnvironmentSpec
     seed: int
     gamma: float
     shards: int
@@ -172,14 +172,9 @@ class Setup:
     evaluation_episodes: int
     train: InstanceSet
     test: InstanceSet
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     episodes_per_round: int | None = None  # a round ends with this many episodes instead of with its slots' length
     keep_next_observations: bool = False
     members: int = 1  # policies; each has an equal share of the shards, and of the parts of an evaluation
-
-    def make_env(self, n_slots: int) -> BatchedEnv:
-        """An environment of the run, as its policy sees it."""
-        return make_batched(self.env_id, n_slots, context_visible=self.context_visible, kwargs=self.env_kwargs)
 
     def instances(self, split: Split) -> InstanceSet:
         """The instance set of a split."""
@@ -252,7 +247,8 @@ class Worker:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self._first = [setup.make_env(setup.slots)]  # whatever is wrong with it shall be known before any work is asked
+        self._open: list[BatchedEnv] = []
+        self._first = [self._make(setup.slots)]  # whatever is wrong with it shall be known before any work is asked
         self._stages: dict[int, Stage] = {}  # by shard; what is beyond LIVE shares one
         self._evaluating: dict[int, BatchedEnv] = {}
         self._scoring: BatchedEnv | None = None
@@ -281,7 +277,7 @@ class Worker:
         setup, shard = self._setup, asked["shard"]
         seat = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
         if seat not in self._stages:
-            self._stages[seat] = Stage(self._first.pop() if self._first else setup.make_env(setup.slots))
+            self._stages[seat] = Stage(self._first.pop() if self._first else self._make(setup.slots))
         return collect(
             self._stages[seat], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
@@ -306,7 +302,7 @@ class Worker:
         """`(m,)` V(s0, c) of any (m, d) contexts: means over start observations whose seeds belong to `version`."""
         setup = self._setup
         if self._scoring is None:
-            self._scoring = setup.make_env(setup.slots)
+            self._scoring = self._make(setup.slots)
         wanted = np.repeat(contexts, setup.start_states, axis=0)
         seeds = episode_seeds(setup.seed, Purpose.CONTEXT_STARTS, version, count=len(wanted))
         values = np.empty(len(wanted))
@@ -330,8 +326,19 @@ class Worker:
         if not len(trial):
             return Outcomes.none(trial.policy.version)
         if len(trial) not in self._evaluating:
-            self._evaluating[len(trial)] = self._setup.make_env(len(trial))
+            self._evaluating[len(trial)] = self._make(len(trial))
         return evaluate(self._evaluating[len(trial)], [trial])[0]
+
+    def close(self) -> None:
+        """Close its environments; what is asked for afterwards makes new ones."""
+        self._first, self._stages, self._evaluating, self._scoring = [], {}, {}, None
+        while self._open:
+            close(self._open.pop())
+
+    def _make(self, n_slots: int) -> BatchedEnv:
+        env = self._setup.spec.make(n_slots)
+        self._open.append(env)
+        return env
 
 
 class Stage:
@@ -568,9 +575,9 @@ def start_observations(setup: Setup, chunk: int) -> Observations:
     first = chunk * setup.chunk_size
     contexts = setup.train.contexts[first : first + setup.chunk_size]
     contexts = np.repeat(contexts, setup.start_states, axis=0)
-    env = setup.make_env(len(contexts))
-    seeds = episode_seeds(setup.seed, Purpose.START_STATES, chunk, count=len(contexts))
-    return take(env.reset(np.arange(len(contexts)), contexts, seeds), slice(None))
+    with setup.spec.opened(len(contexts)) as env:
+        seeds = episode_seeds(setup.seed, Purpose.START_STATES, chunk, count=len(contexts))
+        return take(env.reset(np.arange(len(contexts)), contexts, seeds), slice(None))
 
 
 def joined(parts: list[Outcomes]) -> Outcomes:

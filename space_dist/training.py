@@ -21,41 +21,24 @@ function of (config, seed).
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import hashlib
 import logging
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from space_dist.building import ensemble_of, learner_of, load_learner, model_of, total_steps
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
-from space_dist.config import GrowingConfig, PPOConfig, RunConfig, TRPOConfig
-from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
-from space_dist.envs import BatchedEnv, make_batched
-from space_dist.envs.observations import alike
+from space_dist.config import GrowingConfig, RunConfig
+from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
 from space_dist.episodes import joined_episodes, mean_sizes, summed, told
-from space_dist.errors import ConfigError, Interrupted
-from space_dist.instances import InstanceSet
-from space_dist.learner import (
-    Arrays,
-    CoupledLearner,
-    Ensemble,
-    Learner,
-    PopulationLearner,
-    Update,
-    make_ensemble,
-    make_learner,
-    member_bytes,
-    refuse_population,
-    refuse_spaces,
-    stack_key,
-)
+from space_dist.errors import Interrupted
+from space_dist.learner import Arrays, CoupledLearner, Learner, Update
 from space_dist.ledger import (
     CURRICULUM,
     METRICS,
@@ -69,108 +52,14 @@ from space_dist.ledger import (
     Status,
     encode_values,
 )
-from space_dist.policy import MlpPolicy, Policy, Several, Statistics, blind, members_of, to_arrays
+from space_dist.policy import Statistics, blind, members_of
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
-from space_dist.seeding import member_seeds
-from space_dist.walk import Unfinished, Walk, stacked, unstacked
+from space_dist.run_state import RunState
+from space_dist.walk import Walk
 
 log = logging.getLogger("space_dist")
 
-ON_POLICY = ("ppo", "trpo", "a2c")
 PROBE = (1 << 32) - 1  # the round in which first scales are measured
-_COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
-
-
-def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setup:
-    """What workers must know. Raises ConfigError if the config cannot work with its environment or instances."""
-    horizon = make_env(config).horizon
-    setup = Setup(
-        env_id=config.env.id,
-        context_visible=config.env.context_visible,
-        seed=config.seed,
-        gamma=config.learner.gamma,
-        shards=config.rollout.shards * config.members,
-        slots=config.rollout.slots,
-        slot_length=config.slot_length(horizon),
-        start_states=config.rollout.start_states,
-        evaluation_episodes=config.evaluation.episodes,
-        train=train,
-        test=test,
-        env_kwargs=config.env.kwargs,
-        episodes_per_round=config.n_episodes,
-        keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
-        members=config.members,
-    )
-    probes = config.learner.normalize_observations or config.learner.normalize_rewards
-    needed = config.round_steps(horizon) * (2 if probes else 1)
-    if config.budget.steps < needed:
-        raise ConfigError(
-            f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
-            + (", and the round before it that gives normalisation its first scales" if probes else "")
-        )
-    env = make_env(config)
-    refuse_spaces(config.learner, env.observation_space, env.action_space)
-    if config.engine == "population":
-        refuse_population(config.learner, env.observation_space, env.action_space)
-    if config.curriculum.ranks_by_start_value and _starts_alike(config, train):
-        raise ConfigError(
-            f"curriculum.kind: {config.curriculum.kind} ranks instances by the value of their start, but all instances "
-            "start with the same observation, so all values tie and the order would be a random one. Set "
-            "env.context_visible: true"
-            + (
-                ", or curriculum.allow_context_blind: true to run the released code's setting"
-                if "allow_context_blind" in type(config.curriculum).model_fields
-                else ""
-            )
-        )
-    # Asks the curriculum for what is not there? Better refused now than on an actor.
-    _refuse_wants(config, make_curriculum(config, train))
-    ensemble_of(config)
-    return setup
-
-
-def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
-    """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
-    kind, learner = config.curriculum.kind, config.learner.kind
-    if curriculum.wants.advantages and learner not in ON_POLICY:
-        raise ConfigError(
-            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
-            f"compute. Allowed learners: {', '.join(ON_POLICY)}"
-        )
-    if config.curriculum.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
-        raise ConfigError(
-            f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
-            "not say (its steps have no `success`)"
-        )
-
-
-def _knows_success(config: RunConfig, contexts: NDArray[np.float64]) -> bool:
-    """Whether a first step in a (1, d) context reports success, true or not."""
-    with _failures_explained(config, "reset or a first step"):
-        env = make_env(config)
-        env.action_space.seed(0)
-        env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
-        return env.step(np.asarray(env.action_space.sample())[None]).success is not None
-
-
-def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
-    """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
-    slots = min(len(train), _COMPARED_STARTS)
-    with _failures_explained(config, "reset"):
-        env = make_env(config, slots)
-        starts = env.reset(np.arange(slots), train.contexts[:slots], np.zeros(slots, dtype=np.uint64))
-    return slots > 1 and alike(starts)
-
-
-@contextlib.contextmanager
-def _failures_explained(config: RunConfig, what: str) -> Iterator[None]:
-    """Somebody else's environment may raise anything."""
-    try:
-        yield
-    except ConfigError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise ConfigError(f"env.id {config.env.id!r}: {what} failed: {type(error).__name__}: {error}") from error
 
 
 @dataclass
@@ -187,30 +76,12 @@ class Progress:
 
 
 @dataclass
-class _Run:
-    """Everything that changes from round to round; `_save` and `_restore` know every field that must survive."""
+class _InFlight:
+    """What is under way: handles of what was asked for, and who waits for them. A resumed run asks for it again."""
 
-    round: int = 0
-    steps: int = 0  # real environment steps
-    episodes: int = 0  # of training, ended
-    iteration: int = 1
-    rounds_left: int | None = None  # in this iteration; None until the selection is known
-    version: int = 0  # of the selection being trained on
-    walk: Walk = field(default_factory=lambda: Walk(-1, ()))
-    sizes: NDArray[np.float64] | None = None  # (slots,) sums of |GAE| over running episodes, where anyone asks
-    rows: int = 0
-    evaluated_at: int = -1  # steps
-    rollouts: list[dict[str, float]] = field(default_factory=list)  # of this iteration's rounds
-    updates: list[dict[str, float]] = field(default_factory=list)
-    gradient_steps: int = 0  # in this iteration
-    scored: Arrays = field(default_factory=dict)  # weights that `values` belong to, where scales change
-    segments: list[Segment] = field(default_factory=list)  # of the replay buffer, as of the last commit
     trained: Selection | None = None  # the selection being trained on, once known
-    seen: list[Episodes] = field(default_factory=list)  # of this iteration's rounds, where anyone asks for them
     ahead: list[Handle] = field(default_factory=list)  # shards of the next round, if they were asked for already
-    acted: Arrays | None = None  # the weights that collect these
-    # Handles, and what they wait for
-    state: Handle = None
+    state: Handle = None  # the curriculum's
     selection: Handle = None
     values: Handle = None
     pending: list[_Pending] = field(default_factory=list)
@@ -262,12 +133,13 @@ class Training:
     ) -> None:
         self._config, self._setup, self._cluster, self._writer = config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
-        self._horizon = make_env(config).horizon
+        spec, self._horizon = setup.spec, setup.spec.horizon
         self._total_steps = total_steps(config, self._horizon)
-        self.learner = learner_of(config)
-        self.ensemble = ensemble_of(config)
-        self._curriculum = make_curriculum(config, setup.train)
-        self._run = _Run()
+        self.learner = learner_of(config, spec)
+        self.ensemble = ensemble_of(config, spec)
+        self._curriculum = make_curriculum(config, setup.train, spec.context_bounds)
+        self._run, self._asked = RunState(), _InFlight()
+        self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
         self._last_commit_round = 0
@@ -291,15 +163,16 @@ class Training:
 
     def work(self) -> Work[None]:
         """What `run` does, as a generator: whoever advances it answers `Wait` and `Learn`."""
-        run, cluster, config = self._run, self._cluster, self._config
+        cluster, config, asked = self._cluster, self._config, self._asked
         checkpoint = self._writer.restore()
         policy = self._restore(checkpoint) if checkpoint else (yield from self._begin())
+        run = self._run
         while not self._is_over():
-            shards: list[Shard] = yield from self._settle(run.ahead or self._collect(policy, lag=0))
-            run.ahead, acted, scales = [], run.acted, self.learner.statistics  # of the weights that acted
-            self._arrived(shards, lag=0 if acted is None else 1)
+            shards: list[Shard] = yield from self._settle(asked.ahead or self._collect(policy, lag=0))
+            asked.ahead, acted, scales = [], run.acted, self.learner.statistics  # of the weights that acted
+            self._arrived(shards, lag=1 if acted else 0)
             run.acted = self._look_ahead(policy)
-            update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted)
+            update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted or None)
             self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             if run.rounds_left == 0:
@@ -325,7 +198,7 @@ class Training:
         policy = cluster.put(self.learner.policy(0))
         first = cluster.begin(cluster.start_values(policy))
         self._adopt(first)
-        bounds = make_env(self._config).context_bounds
+        bounds = self._setup.spec.context_bounds
         if len(self._setup.train) > MOST_VALUED:
             log.info("%d instances: above %d, %s is not written", len(self._setup.train), MOST_VALUED, VALUES)
         self._keep_values({"iteration": 0, "low": bounds.low.tolist(), "high": bounds.high.tolist()}, first)
@@ -340,7 +213,7 @@ class Training:
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
         (seeing,) = members_of(self.learner.policy(0))
-        policy = blind(seeing, self._setup.make_env(1).action_space, PROBE)
+        policy = blind(seeing, self._setup.spec.action_space, PROBE)
         handles = cluster.collect(
             cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=PROBE, steps=0, version=selection.version
         )  # fmt: skip
@@ -357,11 +230,11 @@ class Training:
 
     def _decide(self, policy: Handle) -> Work[None]:
         """Gather what the curriculum asks for and let it choose; the answer is picked up at the next wait."""
-        run, cluster = self._run, self._cluster
+        run, cluster, asked = self._run, self._cluster, self._asked
         probes = yield from self._probe_instances(policy)
         evidence = self._evidence(policy, probes)
         decision = cluster.decide(
-            run.state, run.values, evidence, version=run.version, gradient_steps=run.gradient_steps
+            asked.state, asked.values, evidence, version=run.version, gradient_steps=run.gradient_steps
         )
         row = self._iteration_row(complete=True)
 
@@ -370,7 +243,7 @@ class Training:
             self._append(row)
             self.progress.set_size = int(answers[0]["size"])
 
-        run.pending.append(_Pending([decision.numbers], settle))
+        asked.pending.append(_Pending([decision.numbers], settle))
         self._keep_values({"iteration": run.iteration}, decision, evidence.rescored)
         self._adopt(decision)
         run.iteration += 1
@@ -386,7 +259,7 @@ class Training:
             before = {"before": encode_values(np.concatenate(answers[1:]))} if len(answers) > 1 else {}
             self._writer.append(VALUES, {**row, **before, "after": encode_values(answers[0])})
 
-        self._run.pending.append(_Pending([decision.values, *rescored], settle))
+        self._asked.pending.append(_Pending([decision.values, *rescored], settle))
 
     def _probe_instances(self, policy: Handle) -> Work[list[Outcomes]]:
         """Run the probe episodes that the curriculum asks for, if any, and charge their steps to the budget.
@@ -396,7 +269,7 @@ class Training:
         run, cluster = self._run, self._cluster
         if not self._config.curriculum.probes:
             return []
-        (state,) = yield from self._settle([run.state])
+        (state,) = yield from self._settle([self._asked.state])
         indices = self._curriculum.probes(state, joined_episodes(run.seen))
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
@@ -426,25 +299,29 @@ class Training:
         )  # fmt: skip
 
     def _adopt(self, decision: Decision) -> None:
-        run = self._run
-        run.state, run.selection, run.values = decision.state, decision.selection, decision.values
-        run.rounds_left, run.trained = None, None
+        run, asked = self._run, self._asked
+        asked.state, asked.selection, asked.values = decision.state, decision.selection, decision.values
+        run.rounds_left, asked.trained = None, None
         if self.learner.normalises:
             run.scored = self.learner.scored()
 
         def settle(answers: list[Any]) -> None:
             self._know_selection(answers[0])
+            run.rounds_left = self._rounds_on(answers[0])
 
-        run.pending.append(_Pending([decision.selection], settle))
+        asked.pending.append(_Pending([decision.selection], settle))
 
     def _know_selection(self, selection: Selection) -> None:
-        run, config = self._run, self._config
-        episodes = config.rollout.passes * len(selection.ids)
-        per_round = config.n_episodes or config.learner.n_steps / self._horizon  # of each policy: all pass over it
-        run.rounds_left = 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
-        run.trained = selection
+        self._asked.trained = selection
         if not selection.drawn:
             self.progress.set_size = len(selection.ids)
+
+    def _rounds_on(self, selection: Selection) -> int:
+        """Rounds of an iteration: as many as pass over the selection at full horizon, and one of what is drawn."""
+        config = self._config
+        episodes = config.rollout.passes * len(selection.ids)
+        per_round = config.n_episodes or config.learner.n_steps / self._horizon  # of each policy: all pass over it
+        return 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
 
     def _evaluate(self, policy: Handle) -> None:
         run, cluster = self._run, self._cluster
@@ -468,14 +345,14 @@ class Training:
             self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
             log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
 
-        run.pending.append(_Pending(handles, settle))
+        self._asked.pending.append(_Pending(handles, settle))
         run.evaluated_at = run.steps
 
     def _collect(self, policy: Handle, *, lag: int) -> list[Handle]:
         """Ask for the next round."""
         run = self._run
         return self._cluster.collect(
-            policy, run.selection, run.walk, round=run.round, steps=run.steps, version=run.version, lag=lag
+            policy, self._asked.selection, run.walk, round=run.round, steps=run.steps, version=run.version, lag=lag
         )
 
     def _arrived(self, shards: list[Shard], *, lag: int) -> None:
@@ -488,7 +365,7 @@ class Training:
                 run.round,
             ):
                 raise RuntimeError(f"shard {shard.shard} of round {run.round} answers another question")
-        selection = run.trained
+        selection = self._asked.trained
         if selection is None or run.rounds_left is None:
             raise RuntimeError("a round ended before its selection was known")
         run.walk = run.walk.after(
@@ -500,14 +377,14 @@ class Training:
         run.steps += sum(shard.steps for shard in shards)
         run.episodes += sum(len(shard.episodes) for shard in shards)
 
-    def _look_ahead(self, policy: Handle) -> Arrays | None:
+    def _look_ahead(self, policy: Handle) -> Arrays:
         """With `rollout.overlap`, ask for the next round before the update on this one; returns the weights that act.
 
         Not at the end of an iteration: the next selection is not known yet.
         """
         if not self._config.rollout.overlap or self._run.rounds_left == 0 or self._is_over():
-            return None
-        self._run.ahead = self._collect(policy, lag=1)
+            return {}
+        self._asked.ahead = self._collect(policy, lag=1)
         return self.learner.scored()
 
     def _account(self, shards: list[Shard], update: Update) -> None:
@@ -544,7 +421,7 @@ class Training:
 
     def _settle(self, handles: Sequence[Handle] = ()) -> Work[list[Any]]:
         """Wait for the values of `handles`, and for whatever was asked for since the last wait."""
-        pending, self._run.pending = self._run.pending, []
+        pending, self._asked.pending = self._asked.pending, []
         answers: list[Any] = yield Wait([*handles, *(handle for one in pending for handle in one.handles)])
         at = len(handles)
         for one in pending:
@@ -554,11 +431,11 @@ class Training:
 
     def _iteration_row(self, *, complete: bool) -> Row:
         """One iteration in numbers, and its row of the curriculum's history."""
-        run = self._run
-        if run.trained is None:
+        run, selection = self._run, self._asked.trained
+        if selection is None:
             raise RuntimeError("an iteration ended before its selection was known")
-        trained: Row = {"trained": run.trained.ids.tolist()}
-        if run.trained.drawn:  # the draws whose episodes ended
+        trained: Row = {"trained": selection.ids.tolist()}
+        if selection.drawn:  # the draws whose episodes ended
             seen = joined_episodes(run.seen)
             generated = seen.indices == GENERATED
             trained = {"trained": np.where(generated, GENERATED, self._setup.train.ids[seen.indices]).tolist()}
@@ -626,195 +503,57 @@ class Training:
         )  # fmt: skip
 
     def _save(self) -> Work[Checkpoint]:
-        run = self._run
+        run, asked = self._run, self._asked
         arrays, learner = self.learner.save()
         arrays = {f"learner/{name}": array for name, array in arrays.items()}
-        state, values = yield Wait([run.state, run.values])
+        state, values = yield Wait([asked.state, asked.values])
         remembered, numbers = encode_state(state)
         arrays["values"] = values
         arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
-        arrays |= {f"scored/{name}": array for name, array in run.scored.items()}
-        arrays |= {f"acted/{name}": array for name, array in (run.acted or {}).items()}
-        if run.seen:
-            arrays |= {f"seen/{name}": array for name, array in vars(joined_episodes(run.seen)).items()}
-        arrays |= {f"unfinished/{name}": array for name, array in stacked(run.walk).items()}
-        if run.sizes is not None:
-            arrays["sizes"] = run.sizes
+        data, kept = run.save()
+        arrays |= kept
         if self.ensemble is not None:
             arrays |= {f"ensemble/{name}": array for name, array in self.ensemble.save().items()}
         self._store_transitions()
-        data = {
-            "learner": learner,
-            "curriculum": numbers,
-            "run": {
-                "round": run.round, "steps": run.steps, "episodes": run.episodes, "iteration": run.iteration,
-                "rounds_left": run.rounds_left, "version": run.version,
-                "walk": [run.walk.order_version, list(run.walk.positions)], "rows": run.rows,
-                "evaluated_at": run.evaluated_at, "rollouts": run.rollouts, "updates": run.updates,
-                "gradient_steps": run.gradient_steps,
-            },
-        }  # fmt: skip
-        return Checkpoint(run.round, arrays, data, tuple(run.segments))
+        return Checkpoint(
+            run.round, arrays, {"learner": learner, "curriculum": numbers, "run": data}, tuple(self._segments)
+        )
 
     def _store_transitions(self) -> None:
         """Write what is new in the replay buffer; forget pieces that the buffer has forgotten."""
-        run, learner = self._run, self.learner
+        learner = self.learner
         remembered = learner.seen - learner.capacity
-        run.segments = [segment for segment in run.segments if segment.first + segment.count > remembered]
-        stored = run.segments[-1].first + run.segments[-1].count if run.segments else 0
+        self._segments = [segment for segment in self._segments if segment.first + segment.count > remembered]
+        stored = self._segments[-1].first + self._segments[-1].count if self._segments else 0
         first = max(stored, remembered, 0)
         if learner.seen > first:
             segment = self._writer.write_segment(first, learner.seen - first, learner.transitions(first))
-            run.segments.append(segment)
+            self._segments.append(segment)
 
     def _restore(self, checkpoint: Checkpoint) -> Handle:
-        run, cluster, data = self._run, self._cluster, checkpoint.data["run"]
-        order, positions = data["walk"]
-        run.walk = Walk(order, tuple(positions), self._unfinished(checkpoint) if positions else ())
-        _load_learner(self.learner, checkpoint)
-        run.segments = list(checkpoint.segments)
-        for segment in run.segments:
+        cluster, asked = self._cluster, self._asked
+        run = self._run = RunState.restored(checkpoint, self._setup)
+        load_learner(self.learner, checkpoint)
+        self._segments = list(checkpoint.segments)
+        for segment in self._segments:
             self.learner.remember(self._writer.read_segment(segment), segment.first)
-        for name in (
-            "round", "steps", "episodes", "iteration", "version", "rows", "evaluated_at", "rollouts", "updates",
-            "gradient_steps",
-        ):  # fmt: skip
-            setattr(run, name, data[name])
-        arrays = checkpoint.arrays
-        run.sizes = arrays.get("sizes")
         state = decode_state(
-            self._curriculum.state_type, _under("curriculum/", arrays), checkpoint.data["curriculum"]
+            self._curriculum.state_type, checkpoint.under("curriculum/"), checkpoint.data["curriculum"]
         )  # fmt: skip
         selection = self._curriculum.selection(state)
         self._know_selection(selection)
-        run.rounds_left = data["rounds_left"]
-        run.state, run.selection = cluster.put(state), cluster.put(selection)
-        run.values = cluster.put(arrays["values"])
-        run.scored = _under("scored/", arrays)
-        seen = _under("seen/", arrays)
-        run.seen = [Episodes(**seen)] if seen else []
+        asked.state, asked.selection = cluster.put(state), cluster.put(selection)
+        asked.values = cluster.put(checkpoint.arrays["values"])
         if self.ensemble is not None:
-            self.ensemble.load(_under("ensemble/", arrays))
+            self.ensemble.load(checkpoint.under("ensemble/"))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
-        if (acted := _under("acted/", arrays)) and isinstance(self.learner, Learner):
-            run.acted = acted
-            run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
+        if run.acted and isinstance(self.learner, Learner):
+            asked.ahead = self._collect(cluster.put(self.learner.policy_of(run.acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
-
-    def _unfinished(self, checkpoint: Checkpoint) -> tuple[Unfinished, ...]:
-        """The episodes that run. Raises SpaceDistError if a checkpoint's cannot be this run's."""
-        setup, env = self._setup, make_env(self._config)
-        return unstacked(
-            _under("unfinished/", checkpoint.arrays), shards=setup.shards, slots=setup.slots,
-            features=len(setup.train.names), horizon=env.horizon, action_shape=env.action_space.shape or (),
-        )  # fmt: skip
 
     def _show(self) -> None:
         self.progress.steps = self._run.steps
         self._observe(self.progress)
-
-
-def make_env(config: RunConfig, n_slots: int = 1) -> BatchedEnv:
-    """A config's environment, as its policy sees it."""
-    env = config.env
-    return make_batched(env.id, n_slots, context_visible=env.context_visible, kwargs=env.kwargs)
-
-
-def total_steps(config: RunConfig, horizon: int) -> int:
-    """Environment steps of a whole run: those of the rounds that fit.
-
-    The budget, where rounds end by episodes or probes come between them.
-    """
-    if config.n_episodes is not None or config.curriculum.probes:
-        return config.budget.steps
-    return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
-
-
-def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
-    """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
-    if config.engine != "auto":
-        return config
-    stock = getattr(config.learner, "update", "stock") == "stock"
-    env, engine = make_env(config), "population" if can_share and stock and not config.rollout.overlap else "single"
-    try:
-        refuse_population(config.learner, env.observation_space, env.action_space)
-    except ConfigError:
-        engine = "single"
-    return config.model_copy(update={"engine": engine})
-
-
-def stack_of(config: RunConfig) -> str:
-    """`(16 hex digits)` equal for runs that may be members of one population; empty for those of no population."""
-    if config.engine != "population":
-        return ""
-    env = make_env(config)
-    key = (
-        config.env.model_dump_json(),
-        config.device,
-        stack_key(config.learner, env.observation_space, env.action_space),
-    )
-    return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
-
-
-def memory_of(config: RunConfig) -> int:
-    """About what a run takes of the memory of the process that it shares, in MB; 0 for a run that works alone."""
-    if config.engine != "population" or not isinstance(config.learner, PPOConfig | TRPOConfig):
-        return 0
-    env = make_env(config)
-    each = member_bytes(config.learner, env.observation_space, env.action_space, config.device)
-    return -(-config.members * each >> 20)
-
-
-def learner_of(config: RunConfig) -> Learner | CoupledLearner:
-    """A config's learner with its initial networks."""
-    if config.members == 1:
-        return _learner_of(config, config.seed)
-    members = [_learner_of(config, int(seed)) for seed in member_seeds(config.seed, config.members)]
-    return CoupledLearner([member for member in members if isinstance(member, PopulationLearner)])
-
-
-def _learner_of(config: RunConfig, seed: int) -> Learner:
-    env = make_env(config)
-    return make_learner(
-        config.learner, env.observation_space, env.action_space,
-        seed=seed, n_slots=config.rollout.shards * config.rollout.slots,
-        slot_length=config.slot_length(env.horizon), total_steps=total_steps(config, env.horizon),
-        population=config.engine == "population", device=config.device,
-    )  # fmt: skip
-
-
-def ensemble_of(config: RunConfig) -> Ensemble | None:
-    """The ensemble of value functions that a config's curriculum asks for, if it does, with its initial networks."""
-    env = make_env(config)
-    return make_ensemble(config, env.observation_space, env.context_bounds.names)
-
-
-def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy | Several:
-    """The policy, or policies, that a checkpoint holds."""
-    learner = learner_of(config)
-    _load_learner(learner, checkpoint)
-    return learner.policy(checkpoint.round)
-
-
-def model_of(learner: Learner | CoupledLearner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """A trained policy as arrays and a description: layer by layer, or as torch's state where NumPy cannot act."""
-    policy = learner.policy(version)
-    if isinstance(policy, MlpPolicy):
-        return to_arrays(policy)
-    arrays = learner.scored()
-    first = learner.members[0] if isinstance(learner, CoupledLearner) else learner
-    return arrays, {
-        "format": 2, "version": version, "policy": "torch", "class": str(type(first.model.policy)),
-        "shapes": {name: list(array.shape) for name, array in arrays.items()},
-    }  # fmt: skip
-
-
-def _load_learner(learner: Learner | CoupledLearner, checkpoint: Checkpoint) -> None:
-    learner.load(_under("learner/", checkpoint.arrays), checkpoint.data["learner"])
-
-
-def _under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int:

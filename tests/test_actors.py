@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from space_dist.arithmetic import digest, scipy_probes
+from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import METRICS, Ledger
-from space_dist.training import learner_of, make_setup
 from tests.patience import PATIENCE
 from tests.test_distributed import cluster_class, config, reference, results  # noqa: F401
 from tests.test_learners import config_for, learner_section
@@ -29,9 +29,10 @@ def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -
     import ray
 
     run = config(1)
-    setup = make_setup(run, *read_instances(run))
+    spec = spec_of(run)
+    setup = make_setup(run, spec, *read_instances(run, spec.context_bounds))
     with cluster_class(run, setup) as cluster:
-        policy = cluster.put(learner_of(run).policy(0))
+        policy = cluster.put(learner_of(run, spec).policy(0))
         decision = cluster.begin(cluster.start_values(policy))
         from space_dist.walk import Walk
 
@@ -107,7 +108,8 @@ def test_actors_are_compared_by_all_that_they_compute_with(
 
     policy = {"policy": "MultiInputPolicy"} if env_id.endswith("dict") else {}
     config = config_for(tmp_path, learner_section("ppo", **policy), env_id)
-    setup = make_setup(config, *read_instances(config))
+    spec = spec_of(config)
+    setup = make_setup(config, spec, *read_instances(config, spec.context_bounds))
     section = type("Section", (), {"kind": kind})()
     config = config.model_copy(update={"curriculum": section})
     for wanted, is_central in ((rollout, False), (central, True)):
@@ -120,3 +122,14 @@ def test_actors_are_compared_by_all_that_they_compute_with(
                 distributed.refuse_other_arithmetic(0, {**found, part: "0"})
     monkeypatch.setattr(distributed, "scipy_probes", lambda: iter([("qr", np.zeros(1))]))
     assert distributed.computed(["scipy"]) != {"scipy": digest(scipy_probes())}
+
+
+def test_actors_close_their_environments_where_a_run_ends(tmp_path: Path) -> None:
+    noted = tmp_path / "noted"
+    noted.mkdir()
+    env = {"id": "tests.tiny_env:make_noting", "kwargs": {"folder": str(noted)}}
+    there = config_for(tmp_path, learner_section("ppo"), env=env, resources={"workers": 2})
+    launch(there, tmp_path / "run", resume=True, stop=StopRequests())
+    files = [path.name for path in noted.iterdir()]
+    assert len({name.partition("-")[0] for name in files}) == 3  # processes: two actors, and the driver, to look at one
+    assert [name for name in files if not name.endswith(".closed")] == []

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from space_dist import config as configs
 from space_dist import training
+from space_dist.building import spec_of
 from space_dist.cli import app
 from space_dist.errors import Interrupted, LedgerError
 from space_dist.instances import read_csv
@@ -306,6 +307,7 @@ def test_an_explanation_that_the_run_contradicts_is_none(run_of: Any, tmp_path: 
     for file in changed.glob("status.json"):
         file.unlink()  # else the ledger itself says that it was changed
     stored = configs.load(changed / "config.yaml")
-    train = read_csv(changed / "instances_train.csv", training.make_env(stored).context_bounds)
+    bounds = spec_of(stored).context_bounds
+    train = read_csv(changed / "instances_train.csv", bounds)
     with pytest.raises(LedgerError, match=r"trained on another set .*audit\.py says where"):
-        explain(Ledger(changed), stored, train, 1)
+        explain(Ledger(changed), stored, bounds, train, 1)

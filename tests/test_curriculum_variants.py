@@ -18,13 +18,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from space_dist.building import make_setup, spec_of
 from space_dist.cluster import Central, make_curriculum
 from space_dist.config import RunConfig, load
 from space_dist.curricula import Curriculum, RoundRobin, SetState, Space, variants
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
-from space_dist.training import make_setup
 from tests.test_curricula import as_plain, drive, feedback, make_set, shown, stored_and_restored
 
 SPACE = Path(__file__).parent.parent / "configs" / "pointmass_space.yaml"
@@ -89,7 +89,7 @@ def test_trace_of_each_ranking_by_value(pic: Any, expected: list[tuple[list[int]
     values = [(8, 4, -2, -16), (10, 7, -3, -8), (4, 6, 5, -10), (5.5, 8, 1, -5)]
     decided = follow(space(rank=variants.BY_VALUE[pic]), [1, 2], values)
     assert [(ids, grew) for ids, grew, *_ in decided] == expected
-    through_config = make_curriculum(config_with(f"{{kind: space, eta: 0.125, pic: {pic}}}"), make_set(4))
+    through_config = make_curriculum(config_with(f"{{kind: space, eta: 0.125, pic: {pic}}}"), make_set(4), _bounds())
     assert [(ids, grew) for ids, grew, *_ in follow(through_config, [1, 2], values)] == expected
     # The log tells the signed change whatever is ranked by.
     assert [(numbers["largest_pic"], numbers["smallest_pic"]) for _, _, numbers, _ in decided] == [
@@ -113,7 +113,7 @@ def test_pic_random_and_random_growth_are_one():
     values = np.random.default_rng(0).normal(size=(30, 12)).cumsum(axis=0) * 0.05 + 1
     for more in ("", ", growth: multiply, kappa: 3", ", mean: as_printed", ", adaptive_eta: persistent, patience: 2"):
         one, other = (
-            make_curriculum(config_with(f"{{kind: {kind}{more}}}", "seed=5"), make_set(12))
+            make_curriculum(config_with(f"{{kind: {kind}{more}}}", "seed=5"), make_set(12), _bounds())
             for kind in ("space, pic: random", "random_growth")
         )
         assert as_plain(drive(one, values)) == as_plain(drive(other, values))
@@ -167,7 +167,7 @@ def test_v0_zero_makes_the_first_changes_the_values_themselves():
     first, second = np.array([8.0, 16, 64, 32]), np.array([8.5, 18, 60, 33])
     start = SetState(version=0, order_version=0, size=1, selected=np.array([0]))
     for v0, grew, ids in (("network", True, [2, 4]), ("zero", False, [3])):
-        central = Central(config_with(f"{{kind: space, eta: 0.125, v0: {v0}}}"), make_set(4))
+        central = Central(config_with(f"{{kind: space, eta: 0.125, v0: {v0}}}"), make_set(4), _bounds())
         *_, values = central.begin(first[:3], first[3:])
         assert values.tolist() == (first.tolist() if v0 == "network" else [0.0] * 4)
         new, selection, numbers, after = central.decide(start, values, 0, 1, {"after": 1}, second)
@@ -389,7 +389,8 @@ def test_distances_are_between_contexts_scaled_to_their_bounds(distance: str):
     # (0.75 scaled), 3 is 2 of 8 away (0.5 scaled).
     contexts = np.array([(0, 4, 0), (0, 4, 1.5), (2, 4, 0), (4, 4, 4)])
     instances = InstanceSet(np.arange(1, 5), contexts, ("gate_x", "gate_width", "friction"))
-    curriculum = make_curriculum(config_with(f"{{kind: cspace, growth: schedule, distance: {distance}}}"), instances)
+    config = config_with(f"{{kind: cspace, growth: schedule, distance: {distance}}}")
+    curriculum = make_curriculum(config, instances, _bounds())
     decided = follow(curriculum, [1], [[0.0] * 4] * 3)
     assert [sorted(ids) for ids, *_ in decided] == [[1, 3], [1, 2, 3]]
 
@@ -401,7 +402,7 @@ def test_trace_of_a_fixed_subset():
     instances = make_set(4)
     assert RoundRobin(instances, seed=1).start()[1].ids.tolist() == [4, 3, 2, 1]
     for settings, expected in (("ids: [2, 4]", [4, 2]), ("count: 3", [4, 3, 2]), ("count: 4", [4, 3, 2, 1])):
-        curriculum = make_curriculum(config_with(f"{{kind: fixed, {settings}}}", "seed=1"), instances)
+        curriculum = make_curriculum(config_with(f"{{kind: fixed, {settings}}}", "seed=1"), instances, _bounds())
         decided = drive(curriculum, [(1, 2, 3, 4), (5, -6, 7, -8), (9, 9, 9, 9)], gradient_steps=[1, 0])
         for t, (state, selection, _) in enumerate(decided):
             assert selection.ids.tolist() == expected
@@ -417,7 +418,7 @@ def test_trace_of_a_fixed_subset():
 def test_the_seed_chooses_the_counted_and_a_larger_count_only_adds():
     def members(count: int, seed: int) -> list[int]:
         config = config_with(f"{{kind: fixed, count: {count}}}", f"seed={seed}")
-        return make_curriculum(config, make_set(30)).start()[1].ids.tolist()
+        return make_curriculum(config, make_set(30), _bounds()).start()[1].ids.tolist()
 
     assert len({tuple(sorted(members(5, seed))) for seed in range(10)}) == 10
     assert members(9, 4)[:5] == members(5, 4)
@@ -452,7 +453,7 @@ def test_each_setting_reaches_the_curriculum_and_matters(settings: dict[str, Any
     values = 2 + np.sin(np.arange(60)[:, None] * (1 + np.arange(9) / 8))  # never settles for long
     words = ", ".join(f"{key}: {value}" for key, value in settings.items())
     config = config_with(f"{{kind: space, {words}}}")
-    found = as_plain(drive(make_curriculum(config, make_set(9)), values))
+    found = as_plain(drive(make_curriculum(config, make_set(9), _bounds()), values))
     assert found == as_plain(drive(space(make_set(9), **{"eta": 0.1, "kappa": 1, **settings}), values))
     fewer = dict(list(settings.items())[:-1])  # the last setting alone makes the difference
     assert found != as_plain(drive(space(make_set(9), **{"eta": 0.1, "kappa": 1, **fewer}), values))
@@ -465,11 +466,11 @@ def test_every_variant_survives_storage_and_rows_in_another_order(curriculum: st
     turned = InstanceSet(instances.ids[::-1], instances.contexts[::-1], instances.names)
     values = np.round(np.random.default_rng(2).normal(size=(40, 9)).cumsum(axis=0)) / 4
     steps = np.random.default_rng(3).integers(0, 3, size=39).tolist()
-    decided = drive(make_curriculum(config, instances), values, steps)
-    assert as_plain(drive(make_curriculum(config, turned), values, steps)) == as_plain(decided)
+    decided = drive(make_curriculum(config, instances, _bounds()), values, steps)
+    assert as_plain(drive(make_curriculum(config, turned, _bounds()), values, steps)) == as_plain(decided)
     state = stored_and_restored(decided[0][0])
     for t, (_, _, expected) in enumerate(decided[1:], start=1):
-        fresh = make_curriculum(config, instances)  # nothing may be remembered outside the state
+        fresh = make_curriculum(config, instances, _bounds())  # nothing may be remembered outside the state
         state, selection, numbers = fresh.step(state, feedback(state, values[t - 1], values[t], steps[t - 1]))
         state = stored_and_restored(state)
         assert as_plain([(state, selection, numbers)]) == as_plain([decided[t]])
@@ -493,7 +494,9 @@ def test_the_defaults_are_what_there_was_before_there_were_variants():
         config = config_with(f"{{kind: {kind}}}", "seed=11")
         told = [
             (state.size, selection.ids.tolist(), state.order_version, state.tests, state.growths, state.stalled)
-            for state, selection, _ in drive(make_curriculum(config, make_set(n)), values, [t % 5 for t in range(79)])
+            for state, selection, _ in drive(
+                make_curriculum(config, make_set(n), _bounds()), values, [t % 5 for t in range(79)]
+            )
         ]
         assert hashlib.sha256(repr(told).encode()).hexdigest() == digest
     explicit = config_with(
@@ -548,8 +551,9 @@ def _bounds() -> ContextBounds:
 
 def set_up(curriculum: str, *overrides: str) -> None:
     config = config_with(curriculum, *overrides)
-    train, test = read_csv(config.instances.train, _bounds()), read_csv(config.instances.test, _bounds())
-    make_setup(config, train, test)
+    spec = spec_of(config)
+    train, test = (read_csv(path, spec.context_bounds) for path in (config.instances.train, config.instances.test))
+    make_setup(config, spec, train, test)
 
 
 def test_unknown_ids_are_refused_when_the_run_starts():

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist.building import make_setup, spec_of
 from space_dist.errors import SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import CURRICULUM, METRICS
 from space_dist.place import private_ray
-from space_dist.training import make_setup
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -149,4 +149,5 @@ def test_rays_of_our_own_start_one_at_a_time(
 
 
 def _setup(run: configs.RunConfig) -> Any:
-    return make_setup(run, *read_instances(run))
+    spec = spec_of(run)
+    return make_setup(run, spec, *read_instances(run, spec.context_bounds))

@@ -16,6 +16,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from space_dist import config as configs
+from space_dist.building import resolved, spec_of
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
@@ -23,7 +24,7 @@ from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
 from space_dist.learner.lean import LeanBuffer
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
-from space_dist.training import Progress, resolved
+from space_dist.training import Progress
 from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
 
 UPDATES = 20
@@ -336,8 +337,9 @@ def test_a_population_has_an_update_of_its_own() -> None:
     overrides = ["learner.update=lean", "resources.workers=0"]
     with pytest.raises(ConfigError, match=r"learner\.update: lean says nothing with engine: population"):
         configs.load(SPACE, [*overrides, "engine=population"])
-    assert resolved(configs.load(SPACE, [*overrides, "engine=auto"])).engine == "single"
-    assert resolved(configs.load(SPACE, ["engine=auto"])).engine == "population"
+    lean, stock = (configs.load(SPACE, [*some, "engine=auto"]) for some in (overrides, ()))
+    assert resolved(lean, spec_of(lean)).engine == "single"
+    assert resolved(stock, spec_of(stock)).engine == "population"
 
 
 def test_the_update_is_part_of_what_a_run_is_and_stock_changes_no_identity() -> None:

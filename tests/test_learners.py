@@ -14,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.sac.policies import SACPolicy  # noqa: F401 - named by import path
 
 from space_dist import config as configs
+from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig
 from space_dist.envs.observations import Observations, rows
@@ -27,7 +28,6 @@ from space_dist.ledger import CURRICULUM, FORMAT, METRICS, Ledger, RunWriter, de
 from space_dist.policy import MlpPolicy
 from space_dist.report import build_report, load_run
 from space_dist.rollout import Worker
-from space_dist.training import learner_of, make_setup
 from space_dist.walk import Walk
 from tests.test_learner import hand_made
 
@@ -119,7 +119,7 @@ def test_a_run_of_an_earlier_format_is_read_and_not_gone_on_with(tmp_path: Path)
     with pytest.raises(ConfigError, match=words):
         launch(config, out, resume=True, stop=StopRequests())
     assert {name: (out / name).read_bytes() for name in before} == before
-    assert policy_of(Ledger(out)).version == 3
+    assert policy_of(Ledger(out), spec_of(config)).version == 3
     assert load_run(Ledger(out)).status.format == 1
     (out / "status.json").unlink()
     with pytest.raises(ConfigError, match=words):
@@ -189,13 +189,14 @@ def test_runs_do_what_they_say(kind: str, references: Any) -> None:
         log_alphas = [row["learner"]["log_alpha"] for row in iterations if row["gradient_steps"]]
         assert all(-0.2 < one < 0.0 for one in log_alphas)  # it starts at 0 and entropy is larger than its target
         assert log_alphas == sorted(log_alphas, reverse=True)
-    learner = learner_of(config)
+    spec = spec_of(config)
+    learner = learner_of(config, spec)
     checkpoint = decode_checkpoint(ledger.checkpoint_files()[0].read_bytes())
     learner.load(
         {name.removeprefix("learner/"): array for name, array in checkpoint.arrays.items()}, checkpoint.data["learner"]
     )
     observations = np.random.default_rng(0).uniform(-1.0, 1.0, size=(9, 2)).astype(np.float32)
-    for policy in (policy_of(ledger), learner.policy(ROUNDS)):
+    for policy in (policy_of(ledger, spec), learner.policy(ROUNDS)):
         assert isinstance(policy, MlpPolicy)
         np.testing.assert_array_equal(policy.outputs(observations), learner.policy(0).outputs(observations))
         np.testing.assert_array_equal(policy.values(observations), learner.policy(0).values(observations))
@@ -303,7 +304,7 @@ def test_a_restored_learner_has_the_whole_buffer(references: Any) -> None:
     config, folder, _ = references["dqn"]
     ledger = Ledger(folder)
     checkpoint = decode_checkpoint(ledger.checkpoint_files()[0].read_bytes())
-    learner = learner_of(config)
+    learner = learner_of(config, spec_of(config))
     for segment in checkpoint.segments:
         with np.load(ledger.replay / segment.name) as file:
             learner.remember(dict(file), segment.first)
@@ -564,10 +565,11 @@ def test_policies_through_torch_train_and_resume(name: str, tmp_path: Path) -> N
     iterations = [row for row in Ledger(tmp_path / "reference").rows() if row["kind"] == "iteration"]
     assert sum(row["gradient_steps"] for row in iterations) > 0
     assert resumed(config, tmp_path / "run") == expected
-    assert isinstance(policy_of(Ledger(tmp_path / "run")), TorchPolicy)
+    spec = spec_of(config)
+    assert isinstance(policy_of(Ledger(tmp_path / "run"), spec), TorchPolicy)
     # The model's arrays are torch's state.
     with np.load(tmp_path / "run" / "model.npz") as file:
-        learner_of(config).model.policy.load_state_dict({key: torch.as_tensor(file[key]) for key in file.files})
+        learner_of(config, spec).model.policy.load_state_dict({key: torch.as_tensor(file[key]) for key in file.files})
     assert json.loads((tmp_path / "run" / "model.json").read_bytes())["policy"] == "torch"
 
 
@@ -584,7 +586,8 @@ def test_policies_of_other_kinds_on_ray(what: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", TORCH)
 def test_policies_through_torch_are_stable_baselines3s(name: str, tmp_path: Path) -> None:
-    learner = learner_of(torch_config(name, tmp_path))
+    config = torch_config(name, tmp_path)
+    learner = learner_of(config, spec_of(config))
     kind, network = TORCH[name][0], learner.model.policy
     policy = learner.policy(3)
     assert isinstance(policy, TorchPolicy)
@@ -709,9 +712,10 @@ def test_rounds_collected_ahead_are_the_same_wherever_and_after_any_interruption
 def test_old_rounds_are_valued_by_the_weights_that_acted(tmp_path: Path) -> None:
     """After updates on other rounds, values and log-probabilities are still those of the round's own policy."""
     config = config_for(tmp_path, learner_section("ppo"))
-    setup = make_setup(config, *read_instances(config))
-    learner, fresh = learner_of(config), learner_of(config)
-    worker, selection = Worker(setup), make_curriculum(config, setup.train).start()[1]
+    spec = spec_of(config)
+    setup = make_setup(config, spec, *read_instances(config, spec.context_bounds))
+    learner, fresh = learner_of(config, spec), learner_of(config, spec)
+    worker, selection = Worker(setup), make_curriculum(config, setup.train, spec.context_bounds).start()[1]
     asked: dict[str, Any] = {"steps": 0, "selection_version": 0}
     first = [worker.collect(learner.policy(0), selection, Walk(-1, ()), round=0, shard=k, **asked) for k in range(4)]
     acted = learner.scored()

@@ -336,7 +336,7 @@ def collected(kind: str, head: Head, before: int) -> tuple[list[Shard], list[Noi
     policy = MlpPolicy(4, "relu", head, (layer,), ())
     asked = {"round": 4, "steps": before, "selection_version": 0}
     shards = [worker.collect(policy, selection(), Walk(-1, ()), shard=shard, **asked) for shard in range(setup.shards)]
-    space = setup.make_env(1).action_space
+    space = setup.spec.action_space
     noise = [Noise.draw(head, space, generator(setup.seed, Purpose.ACTIONS, 4, shard), (16, 4)) for shard in range(3)]
     return shards, noise, policy
 

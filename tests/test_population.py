@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist import rollout
+from space_dist.building import learner_of, make_setup, memory_of, spec_of
 from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
@@ -25,7 +26,6 @@ from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.policy import members_of
 from space_dist.population import advance, member
 from space_dist.rollout import Shard, Worker
-from space_dist.training import learner_of, make_setup, memory_of
 from space_dist.walk import Walk
 from tests.grids import ROOT
 from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results
@@ -151,7 +151,8 @@ def test_what_a_member_takes_of_the_memory_is_foreseen(kind: str, tmp_path: Path
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     few, many = map(int, said.split())
     each = (many - few) / 8 / 2**20
-    assert each <= memory_of(load(path)) <= 3 * each
+    config = load(path)
+    assert each <= memory_of(config, spec_of(config)) <= 3 * each
 
 
 def test_a_member_that_is_asked_to_stop_stops_alone(tmp_path: Path) -> None:
@@ -235,14 +236,15 @@ def test_policies_that_share_a_curriculum_are_one_run(tmp_path: Path) -> None:
 
 def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> None:
     config = coupled(tmp_path)
-    setup = make_setup(config, *read_instances(config))
-    learner = learner_of(config)
+    spec = spec_of(config)
+    setup = make_setup(config, spec, *read_instances(config, spec.context_bounds))
+    learner = learner_of(config, spec)
     assert isinstance(learner, CoupledLearner)
     policy, worker = learner.policy(0), Worker(setup)
     own = [worker.start_values(member, 0) for member in policy.members]
     assert np.array_equal(worker.start_values(policy, 0), np.mean(own, axis=0))
     assert not np.array_equal(own[0], own[1])
-    selection = make_curriculum(config, setup.train).start()[1]
+    selection = make_curriculum(config, setup.train, spec.context_bounds).start()[1]
     asked = {"round": 0, "steps": 0, "selection_version": 0}
     shards = [worker.collect(policy, selection, Walk(-1, ()), shard=number, **asked) for number in range(setup.shards)]
     single = Worker(dataclasses.replace(setup, members=1))
@@ -250,7 +252,7 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
         member = policy.members[number // 4]
         again = single.collect(member, selection, Walk(-1, ()), shard=number, **asked)
         assert np.array_equal(shard.actions, again.actions)
-    alone = learner_of(config)
+    alone = learner_of(config, spec)
     assert isinstance(alone, CoupledLearner)
     update = learner.update(shards, round=0, steps=3 * N_STEPS)
     for member, mine in zip(alone.members, alone.parts(shards), strict=True):
@@ -297,12 +299,13 @@ def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:
     config = coupled(tmp_path, evaluation={"every_steps": 100, "episodes": 2})
     alone(config, tmp_path / "run")
     first = Ledger(tmp_path / "run").rows()[0]
-    learner, setup = learner_of(config), make_setup(config, *read_instances(config))
+    spec = spec_of(config)
+    learner, setup = learner_of(config, spec), make_setup(config, spec, *read_instances(config, spec.context_bounds))
     single = Worker(dataclasses.replace(setup, members=1, shards=1))
     outcomes = [single.evaluate(member, "test", 0).returns.reshape(-1, 2).mean(axis=1)
                 for member in members_of(learner.policy(0))]  # fmt: skip
     assert first["test"]["returns"] == pytest.approx(np.mean(outcomes, axis=0).tolist(), abs=1e-6)
-    assert len(members_of(policy_of(Ledger(tmp_path / "run")))) == 3
+    assert len(members_of(policy_of(Ledger(tmp_path / "run"), spec))) == 3
 
 
 @pytest.mark.parametrize(

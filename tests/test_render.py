@@ -16,6 +16,7 @@ from PIL import Image, ImageSequence
 
 from space_dist import cli
 from space_dist import config as configs
+from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
@@ -26,7 +27,6 @@ from space_dist.policy import MlpPolicy, to_arrays
 from space_dist.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.rollout import Worker
 from space_dist.tracking import runs, sync
-from space_dist.training import learner_of, make_setup
 from tests.test_report import finished_run, written
 
 BLUE, GREEN, RED = (0, 114, 178), (0, 158, 115), (213, 94, 0)
@@ -46,7 +46,7 @@ def run_of(
         "rollout": {"shards": 1, "slots": 1}, "budget": {"steps": 2048}, "tracking": {"uri": None},
     }  # fmt: skip
     config = configs.parse(data, "test")
-    policy = learner_of(config).policy(0)
+    policy = learner_of(config, spec_of(config)).policy(0)
     assert isinstance(policy, MlpPolicy)
     if bias is not None:
         matrix, _ = policy.actor[-1]
@@ -113,8 +113,9 @@ def test_episodes_are_those_of_the_runs_evaluation(tmp_path: Path) -> None:
     config = configs.load(ledger.config)
     names = ("gate_x", "gate_width", "friction")
     sets = [InstanceSet(np.arange(2) + start, contexts[start : start + 2], names) for start in (0, 2)]
-    worker = Worker(make_setup(config, *sets))
-    expected = {split: worker.evaluate(policy_of(ledger), split, 0) for split in ("train", "test")}
+    spec = spec_of(config)
+    worker = Worker(make_setup(config, spec, *sets))
+    expected = {split: worker.evaluate(policy_of(ledger, spec), split, 0) for split in ("train", "test")}
     written = draw_run(ledger, tmp_path / "pictures", [3, 0, 1, 2])
     for (path, what), (split, place) in zip(
         written, [("test", 1), ("train", 0), ("train", 1), ("test", 0)], strict=False

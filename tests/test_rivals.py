@@ -20,6 +20,7 @@ from scipy import stats
 from sklearn.mixture import GaussianMixture
 
 from space_dist import config as configs
+from space_dist.building import make_setup, spec_of
 from space_dist.cluster import make_curriculum
 from space_dist.curricula import (
     Curriculum,
@@ -49,7 +50,6 @@ from space_dist.policy import EnsemblePolicy, Statistics
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout import Setup, Shard, Worker
 from space_dist.seeding import Purpose, generator
-from space_dist.training import make_setup
 from space_dist.walk import Walk
 from tests.tiny_env import Line
 
@@ -157,10 +157,10 @@ def tiny_shards(config: configs.RunConfig, seed: int = 0) -> tuple[Worker, Any, 
     """A worker, a learner, and a round that they collected on the line of `tests.tiny_env`."""
     line = InstanceSet(np.arange(3), np.array([[-0.5], [0.0], [0.5]]), ("target",))
     test = InstanceSet(np.array([9]), np.array([[0.25]]), ("target",))
-    setup: Setup = make_setup(config, line, test)
-    env = setup.make_env(1)
+    setup: Setup = make_setup(config, spec_of(config), line, test)
+    spec = setup.spec
     learner = make_learner(
-        config.learner, env.observation_space, env.action_space, seed=seed, n_slots=4, slot_length=32, total_steps=512
+        config.learner, spec.observation_space, spec.action_space, seed=seed, n_slots=4, slot_length=32, total_steps=512
     )
     selection = Uniform(line, seed=0, draws=Draws(64, 2)).start()[1]
     worker = Worker(setup)
@@ -172,8 +172,8 @@ def tiny_shards(config: configs.RunConfig, seed: int = 0) -> tuple[Worker, Any, 
 def test_each_member_is_fitted_to_its_own_lambda_returns() -> None:
     config = vds_config()
     worker, _, shards = tiny_shards(config)
-    env = worker._setup.make_env(1)
-    ensemble = Ensemble(config.curriculum, config.learner, env.observation_space, ("target",), seed=0)  # type: ignore[arg-type]
+    spec = worker._setup.spec
+    ensemble = Ensemble(config.curriculum, config.learner, spec.observation_space, ("target",), seed=0)  # type: ignore[arg-type]
     policy = ensemble.policy(Statistics())
     found = ensemble._targets(shards, Statistics()).returns
     shard, expected = shards[0], np.zeros((3, 32, 2))
@@ -197,10 +197,10 @@ def test_each_member_is_fitted_to_its_own_lambda_returns() -> None:
 def test_an_ensemble_learns_differs_and_is_restored_bit_for_bit() -> None:
     config = vds_config()
     worker, _, shards = tiny_shards(config)
-    env = worker._setup.make_env(1)
+    spec = worker._setup.spec
 
     def fresh(seed: int = 0) -> Ensemble:
-        return Ensemble(config.curriculum, config.learner, env.observation_space, ("target",), seed=seed)  # type: ignore[arg-type]
+        return Ensemble(config.curriculum, config.learner, spec.observation_space, ("target",), seed=seed)  # type: ignore[arg-type]
 
     def scored(one: Ensemble) -> np.ndarray:
         return worker.start_values(one.policy(Statistics()), 0)
@@ -222,8 +222,8 @@ def test_an_ensemble_learns_differs_and_is_restored_bit_for_bit() -> None:
 def test_stacked_members_take_the_steps_that_each_would_take_alone() -> None:
     config = vds_config()
     worker, _, shards = tiny_shards(config)
-    env = worker._setup.make_env(1)
-    ensemble = Ensemble(config.curriculum, config.learner, env.observation_space, ("target",), seed=0)  # type: ignore[arg-type]
+    spec = worker._setup.spec
+    ensemble = Ensemble(config.curriculum, config.learner, spec.observation_space, ("target",), seed=0)  # type: ignore[arg-type]
     targets = ensemble._targets(shards, Statistics())
     network = torch.nn.Sequential(
         torch.nn.Linear(2, 64), torch.nn.Tanh(), torch.nn.Linear(64, 64), torch.nn.Tanh(), torch.nn.Linear(64, 1)
@@ -639,7 +639,7 @@ def test_the_first_fit_comes_after_fit_rate_finished_episodes(from_set: bool) ->
 
 def made(curriculum: str, train: InstanceSet, seed: int = 0) -> Curriculum:
     settings = configs.load(SPACE, [f"curriculum={curriculum}"]).curriculum
-    return Makers(train, source="train.csv", seed=seed, draws=Draws(20, 2), bounds=lambda: BOUNDS).make(settings)
+    return Makers(train, source="train.csv", seed=seed, draws=Draws(20, 2), bounds=BOUNDS).make(settings)
 
 
 def sets(curriculum: Curriculum, values: list[list[float]]) -> list[list[int]]:
@@ -847,11 +847,12 @@ def test_settings_that_make_no_sense_are_refused(curriculum: str, words: str) ->
 
 def set_up(*overrides: str) -> None:
     config = configs.load(SPACE, list(overrides))
-    bounds = make_batched(config.env.id, 1, context_visible=False).context_bounds
+    spec = spec_of(config)
+    bounds = spec.context_bounds
     middle = (bounds.low + bounds.high) / 2.0
     contexts = middle + np.linspace(-0.1, 0.1, 30)[:, None] * np.random.default_rng(0).random((30, len(middle)))
     train = InstanceSet(np.arange(30), contexts, bounds.names)
-    make_setup(config, train, InstanceSet(np.array([99]), middle[None], bounds.names))
+    make_setup(config, spec, train, InstanceSet(np.array([99]), middle[None], bounds.names))
 
 
 class Silent(Line):
@@ -891,8 +892,8 @@ def test_shipped_rivals_can_be_made() -> None:
         config = configs.load(path)
         assert path.stem == config.name
         if config.env.id == "space_dist/PointMass-v0":
-            bounds = make_batched(config.env.id, 1, context_visible=False).context_bounds
-            make_curriculum(config, read_csv(config.instances.train, bounds)).start()
+            bounds = spec_of(config).context_bounds
+            make_curriculum(config, read_csv(config.instances.train, bounds), bounds).start()
 
 
 def test_contexts_of_instances_are_worth_what_their_start_values_say() -> None:
@@ -904,12 +905,12 @@ def test_contexts_of_instances_are_worth_what_their_start_values_say() -> None:
     # The line's starts are random within 0.1 of 0, and the value of a fresh network hardly depends on that.
     np.testing.assert_allclose(found, worker.start_values(policy, 0), atol=0.3)
     still = configs.load(SPACE)
-    bounds = make_batched(still.env.id, 1, context_visible=False).context_bounds
+    spec = spec_of(still)
+    bounds = spec.context_bounds
     train, test = (read_csv(path, bounds) for path in (still.instances.train, still.instances.test))
-    point = Worker(make_setup(still, train, test))
-    env = point._setup.make_env(1)
+    point = Worker(make_setup(still, spec, train, test))
     policy = make_learner(
-        still.learner, env.observation_space, env.action_space, seed=0, n_slots=16, slot_length=128, total_steps=2048
+        still.learner, spec.observation_space, spec.action_space, seed=0, n_slots=16, slot_length=128, total_steps=2048
     ).policy(0)
     values = point.context_values(policy, train.contexts[:7], version=0)
     np.testing.assert_allclose(values, point.start_values(policy, 0)[:7], atol=1e-6)

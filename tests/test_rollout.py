@@ -18,6 +18,7 @@ from space_dist.curricula import Selection
 from space_dist.envs import ContextObservation, make_batched
 from space_dist.envs.interface import FloatArray, IntArray, Observations, Step
 from space_dist.envs.observations import distinct
+from space_dist.envs.spec import read_spec
 from space_dist.errors import SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.learner import make_learner
@@ -110,11 +111,11 @@ def uniform(n: int, seed: int = 0) -> FloatArray:
     return np.random.default_rng(seed).uniform(LOW, HIGH, size=(n, 3))
 
 
-def setup_for(env_id: str = POINTMASS, **changes: Any) -> Setup:
+def setup_for(env_id: str = POINTMASS, *, context_visible: bool = True, **changes: Any) -> Setup:
     names = ("gate_x", "gate_width", "friction")
     setup = Setup(
-        env_id=env_id, context_visible=True, seed=3, gamma=0.9, shards=3, slots=4, slot_length=120, start_states=1,
-        evaluation_episodes=1, train=InstanceSet(np.arange(10), uniform(10), names),
+        spec=read_spec(env_id, context_visible=context_visible), seed=3, gamma=0.9, shards=3, slots=4, slot_length=120,
+        start_states=1, evaluation_episodes=1, train=InstanceSet(np.arange(10), uniform(10), names),
         test=InstanceSet(np.arange(5), uniform(5, seed=1), names),
     )  # fmt: skip
     return dataclasses.replace(setup, **changes)

@@ -7,6 +7,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import uuid
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,6 +65,22 @@ def make(n_slots: int) -> Line:
 
 def make_discrete(n_slots: int) -> Line:
     return Line(n_slots, spaces.Discrete(3))
+
+
+class Noting(Line):
+    """The line, of which a file in `folder` tells that it is open, and another one that it is closed."""
+
+    def __init__(self, n_slots: int, folder: str) -> None:
+        super().__init__(n_slots, spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32))
+        self._folder, self._name = Path(folder), f"{os.getpid()}-{uuid.uuid4().hex}"
+        (self._folder / f"{self._name}.open").touch()
+
+    def close(self) -> None:
+        (self._folder / f"{self._name}.open").rename(self._folder / f"{self._name}.closed")
+
+
+def make_noting(n_slots: int, folder: str) -> Noting:
+    return Noting(n_slots, folder)
 
 
 class Scaled(Line):

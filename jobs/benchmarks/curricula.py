@@ -19,11 +19,12 @@ from threadpoolctl import threadpool_limits
 from benchmarks.curriculum import ppo_update_seconds
 from benchmarks.measure import duration
 from space_dist import config as configs
+from space_dist.building import make_setup, spec_of
 from space_dist.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.instances import InstanceSet, sample
 from space_dist.ledger import Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray
-from space_dist.training import Training, make_setup
+from space_dist.training import Training
 
 ROOT = Path(__file__).resolve().parents[2]
 console = Console()
@@ -90,7 +91,7 @@ class _Timed(InProcess):
     """The cluster of a run without Ray that notes the CPU time of what is done for the curriculum."""
 
     def __init__(self, config: configs.RunConfig, train: InstanceSet, test: InstanceSet) -> None:
-        setup = make_setup(config, train, test)
+        setup = make_setup(config, spec_of(config), train, test)
         super().__init__(config, setup)
         self.setup, self.spent = setup, defaultdict[str, list[float]](list)
         self._searches = config.curriculum.kind == "spdrl"

@@ -25,11 +25,12 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from space_dist import config as configs
+from space_dist.building import make_setup, spec_of
 from space_dist.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.instances import read_csv
 from space_dist.ledger import METRICS, Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray, IntArray, Split, joined
-from space_dist.training import Training, make_env, make_setup
+from space_dist.training import Training
 
 ROOT = Path(__file__).resolve().parents[2]
 RANKS = ("improvement", "abs", "relative", "lowest_value", "random")
@@ -143,9 +144,9 @@ def _run(rank: str, seed: int, steps: int) -> dict[str, float]:
          "checkpoint.every_rounds=100000", "checkpoint.every_seconds=100000"],
         seed=seed,
     )  # fmt: skip
-    bounds = make_env(config).context_bounds
-    train, test = (read_csv(path, bounds) for path in (config.instances.train, config.instances.test))
-    cluster = _Watched(config, make_setup(config, train, test))
+    spec = spec_of(config)
+    train, test = (read_csv(path, spec.context_bounds) for path in (config.instances.train, config.instances.test))
+    cluster = _Watched(config, make_setup(config, spec, train, test))
     status = Status("running", config.name, seed, 0, config.budget.steps, 0, 0.0, 0.0)
     with tempfile.TemporaryDirectory() as folder, RunWriter(Ledger(folder)) as writer:
         writer.restore()

@@ -56,10 +56,10 @@ def instances_check(
     ] = None,
 ) -> None:
     """Check instance files and show what is in them."""
-    from space_dist.envs import make_batched
+    from space_dist.envs.spec import read_spec
     from space_dist.instances import read_csv, refuse_overlap, summary
 
-    bounds = make_batched(env, 1, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
+    bounds = read_spec(env, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
     sets = [read_csv(file, bounds, columns or (), if_there=True) for file in files]
     for index, one in enumerate(sets):
         for other in range(index):
@@ -96,11 +96,12 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
+    from space_dist.building import make_setup, spec_of
     from space_dist.launch import read_instances
-    from space_dist.training import make_setup
 
     run = configs.load(config, list(overrides or []))
     with about(str(config)):
-        make_setup(run, *read_instances(run))
+        spec = spec_of(run)
+        make_setup(run, spec, *read_instances(run, spec.context_bounds))
     print(configs.dump(run), end="")
     delivered()

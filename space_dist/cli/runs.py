@@ -73,6 +73,7 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
+    from space_dist.building import spec_of
     from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
     from space_dist.launch import policy_of, stored_config
@@ -81,25 +82,27 @@ def evaluate(
     from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.seeding import Purpose, episode_seeds
-    from space_dist.training import make_env
 
     ledger = Ledger(run)
     status = ledger.status()
     state = "abandoned" if ledger.abandoned(status) else status.state
     config = stored_config(ledger)
-    policies = members_of(policy_of(ledger))
-    chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
-    env = make_env(config, len(chosen))
+    spec = spec_of(config)
+    policies = members_of(policy_of(ledger, spec))
+    chosen = read_csv(instances, spec.context_bounds, config.curriculum.columns, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
-    with exits_refused():
+    optimum = None
+    with exits_refused(), spec.opened(len(chosen)) as env:
         outcomes = [evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])[0]
                     for policy in policies]  # fmt: skip
+        if isinstance(world := unwrapped(env), KnowsOptimum):
+            optimum = world.optimal_returns(chosen.contexts)
     names = {"return": "returns", "discounted_return": "discounted_returns", "length": "lengths", "success": "success"}
     columns = {  # over all policies, where the run trains several
         column: np.mean([getattr(outcome, name) for outcome in outcomes], axis=0) for column, name in names.items()
     }
-    if isinstance(world := unwrapped(env), KnowsOptimum):
-        columns["optimal_return"] = world.optimal_returns(chosen.contexts)
+    if optimum is not None:
+        columns["optimal_return"] = optimum
     means = {name: None if np.isnan(values).all() else float(np.mean(values)) for name, values in columns.items()}
     if "optimal_return" in columns:  # a share of sums: no single episode's return need be positive
         means["share_of_optimum"] = float(columns["return"].sum() / columns["optimal_return"].sum())
@@ -127,18 +130,19 @@ def explain(
     iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
 ) -> None:
     """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 12)."""
+    from space_dist.building import spec_of
     from space_dist.instances import read_csv
     from space_dist.launch import stored_config
     from space_dist.ledger import Ledger
     from space_dist.report.decisions import explain as explain_decision
-    from space_dist.training import make_env
 
     ledger = Ledger(run)
     ledger.status()
     config = stored_config(ledger)
     ledger.read(ledger.instances("train"))
-    train = read_csv(ledger.instances("train"), make_env(config).context_bounds, config.curriculum.columns)
-    for line in explain_decision(ledger, config, train, iteration):
+    bounds = spec_of(config).context_bounds
+    train = read_csv(ledger.instances("train"), bounds, config.curriculum.columns)
+    for line in explain_decision(ledger, config, bounds, train, iteration):
         print(line)
     delivered()
 

@@ -23,14 +23,14 @@ def env_check(
     ] = None,
 ) -> None:
     """Say in plain words what is wrong with an environment. Exit code 0: nothing; 2: something."""
-    from space_dist.envs import make_batched
     from space_dist.envs.checker import check
+    from space_dist.envs.spec import read_spec
     from space_dist.instances import read_csv
 
     kwargs = parse_kwargs(kwarg)
     chosen = None
     if instances is not None:
-        chosen = read_csv(instances, make_batched(env, 1, context_visible=False, kwargs=kwargs).context_bounds)
+        chosen = read_csv(instances, read_spec(env, context_visible=False, kwargs=kwargs).context_bounds)
     findings = check(env, kwargs, chosen)
     for note in findings.notes:
         say(f"note: {note}")

@@ -42,12 +42,10 @@ class Makers:
 
     train: the instance set, and `source` the file it came from.
     draws: how many a round can use.
-    bounds: asks the environment for the bounds of its contexts; only called by those that need them.
+    bounds: of the contexts of the environment.
     """
 
-    def __init__(
-        self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: Callable[[], ContextBounds]
-    ) -> None:
+    def __init__(self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds) -> None:
         self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
 
     def make(self, settings: CurriculumConfig) -> Curriculum:
@@ -88,7 +86,7 @@ class Makers:
 
     def _context_space(self, settings: ContextSpaceConfig) -> Space:
         by_distance = {"centroid": variants.near_centroid, "nearest_member": variants.near_member}
-        rank = by_distance[settings.distance](self._bounds().scale(self._train.contexts))
+        rank = by_distance[settings.distance](self._bounds.scale(self._train.contexts))
         return self._growing(settings, variants.directed(rank, settings.reverse))
 
     def _manual(self, settings: ManualConfig) -> Space:
@@ -131,7 +129,7 @@ class Makers:
 
     def _alp_gmm(self, settings: AlpGmmConfig) -> AlpGmm:
         return AlpGmm(
-            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds(), from_set=settings.over == "set",
+            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, from_set=settings.over == "set",
             random_share=settings.random_share, fit_rate=settings.fit_rate, history=settings.history,
             components=settings.components,
         )  # fmt: skip
@@ -153,7 +151,7 @@ class Makers:
         )  # fmt: skip
 
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
-        bounds = self._bounds()
+        bounds = self._bounds
         middle, width = (bounds.low + bounds.high) / 2.0, bounds.high - bounds.low
         initial = Gaussian.of(
             self._features("initial_mean", settings.initial_mean, bounds, middle),

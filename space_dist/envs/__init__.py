@@ -17,7 +17,7 @@ from space_dist.envs.antgoal import BatchedAntGoal
 from space_dist.envs.ballcatching import BatchedBallCatching
 from space_dist.envs.carl import CarlEnv, is_carl
 from space_dist.envs.cartpole import BatchedCartPole
-from space_dist.envs.interface import BatchedEnv, ContextVisible, Drawable, DrawsContexts, KnowsOptimum, Step
+from space_dist.envs.interface import BatchedEnv, ContextVisible, Drawable, DrawsContexts, KnowsOptimum, Step, close
 from space_dist.envs.maze import BatchedMaze
 from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
@@ -103,9 +103,11 @@ def distribution_of(env_id: str, kwargs: Mapping[str, Any] = MappingProxyType({}
     """
     env = make_batched(env_id, 1, context_visible=False, kwargs=kwargs)
     bounds = env.context_bounds
-    if isinstance(env, DrawsContexts):
+    if isinstance(env, DrawsContexts):  # stays open: whoever has the distribution draws with it
         return Distribution(f"{env_id}, its own", "the environment", bounds, env.draw_contexts)
-    if isinstance(env, BatchedSingles) and env.whole_contexts:
+    whole = isinstance(env, BatchedSingles) and env.whole_contexts
+    close(env)
+    if whole:
         return Distribution(
             f"{env_id}, whole numbers, uniform within the bounds", "the environment (the bounds)", bounds,
             lambda rng, n: rng.integers(
@@ -213,6 +215,7 @@ __all__ = [
     "Observations",
     "SingleEnv",
     "Step",
+    "close",
     "distribution_of",
     "make_batched",
     "takes_argument",

@@ -7,10 +7,11 @@ bit. Faults are looked for in an order in which each can be told from the ones b
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final
@@ -21,7 +22,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, distribution_of, make_batched
+from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, close, distribution_of, make_batched
 from space_dist.envs.interface import FloatArray, Step
 from space_dist.envs.observations import Observations
 from space_dist.errors import ConfigError, SpaceDistError
@@ -95,26 +96,29 @@ class _Check:
         self, env_id: str, kwargs: Mapping[str, Any], instances: InstanceSet | None, findings: Findings
     ) -> None:
         self._env_id, self._kwargs, self._findings = env_id, kwargs, findings
-        env = self._make(1)
-        self._horizon = findings.horizon = env.horizon
-        self._bounds = env.context_bounds
-        findings.names = self._bounds.names
-        self._drawn = instances is None and not isinstance(env, DrawsContexts)  # uniformly: features vary one by one
-        self._contexts = self._draw() if instances is None else _cycled(instances.contexts, N_CONTEXTS)
-        self._seeds = episode_seeds(0, Purpose.EPISODES, count=N_CONTEXTS)
-        self._actions = _sampled_actions(env.action_space, N_CONTEXTS + 1, max(self._horizon, COMPARED_STEPS))
+        with self._opened(1) as env:
+            self._horizon = findings.horizon = env.horizon
+            self._bounds = env.context_bounds
+            findings.names = self._bounds.names
+            # Uniformly: features vary one by one.
+            self._drawn = instances is None and not isinstance(env, DrawsContexts)
+            self._contexts = self._draw() if instances is None else _cycled(instances.contexts, N_CONTEXTS)
+            self._seeds = episode_seeds(0, Purpose.EPISODES, count=N_CONTEXTS)
+            self._actions = _sampled_actions(env.action_space, N_CONTEXTS + 1, max(self._horizon, COMPARED_STEPS))
 
     def run(self) -> None:
-        if (single := self._single()) is not None:
-            self._check_single_spaces(single)
+        with self._single() as single:
+            if single is not None:
+                self._check_single_spaces(single)
         self._check_spaces_and_ends()
         reference = self._check_repeated()
         self._check_earlier_episodes(reference)
         self._check_neighbours(reference)
         self._check_contexts()
-        if (single := self._single()) is not None:
-            self._check_context_survives(single)
-            self._ask_gymnasium()
+        with self._single() as single:
+            if single is not None:
+                self._check_context_survives(single)
+                self._ask_gymnasium()
 
     # ---- the checks ----
 
@@ -148,19 +152,19 @@ class _Check:
     def _check_spaces_and_ends(self) -> None:
         """Whole episodes in all contexts at once: what comes back fits its space, and ends in time."""
         n = N_CONTEXTS
-        env = self._make(n)
-        current = self._reset(env, np.arange(n), self._contexts, self._seeds)
-        self._refuse_misfits(env.observation_space, current, n, "reset")
-        alive = np.ones(n, dtype=np.bool_)
-        for time in range(self._horizon):
-            step = self._step(env, self._actions[:n, time])
-            self._refuse_misfits(env.observation_space, step.observations, n, f"step {time + 1}")
-            self._refuse_step(step, n, time + 1)
-            alive &= ~(step.terminated | step.truncated)
-            if not alive.any():
-                return
-            if len(ended := np.flatnonzero(step.terminated | step.truncated)):
-                self._reset(env, ended, self._contexts[ended], self._seeds[ended])
+        with self._opened(n) as env:
+            current = self._reset(env, np.arange(n), self._contexts, self._seeds)
+            self._refuse_misfits(env.observation_space, current, n, "reset")
+            alive = np.ones(n, dtype=np.bool_)
+            for time in range(self._horizon):
+                step = self._step(env, self._actions[:n, time])
+                self._refuse_misfits(env.observation_space, step.observations, n, f"step {time + 1}")
+                self._refuse_step(step, n, time + 1)
+                alive &= ~(step.terminated | step.truncated)
+                if not alive.any():
+                    return
+                if len(ended := np.flatnonzero(step.terminated | step.truncated)):
+                    self._reset(env, ended, self._contexts[ended], self._seeds[ended])
         raise _FaultError(
             f"episodes do not end: after its horizon of {self._horizon} steps neither terminated nor truncated was set"
         )
@@ -183,34 +187,34 @@ class _Check:
 
     def _check_earlier_episodes(self, reference: Sequence[_Episode]) -> None:
         """The same episodes one after another in one copy, and one broken off."""
-        env = self._make(1)
-        self._play(env, [N_EPISODES], steps=2)
-        for k in [*range(N_EPISODES), 0]:
-            found = self._play(env, [k])[0]
-            if found == reference[k]:
-                continue
-            if found == self._alone(k, context=N_EPISODES):
+        with self._opened(1) as env:
+            self._play(env, [N_EPISODES], steps=2)
+            for k in [*range(N_EPISODES), 0]:
+                found = self._play(env, [k])[0]
+                if found == reference[k]:
+                    continue
+                if found == self._alone(k, context=N_EPISODES):
+                    raise _FaultError(
+                        "a context does not arrive: only that of the very first reset counts, later ones are ignored"
+                    )
+                where = _first_difference(found, reference[k])
+                what = "it starts differently" if where == 0 else f"it differs from step {where} on"
                 raise _FaultError(
-                    "a context does not arrive: only that of the very first reset counts, later ones are ignored"
+                    "the trajectory depends on earlier episodes: played again after others, with the same seed, "
+                    f"context and actions, {what}. reset() must put back everything that an episode changes"
                 )
-            where = _first_difference(found, reference[k])
-            what = "it starts differently" if where == 0 else f"it differs from step {where} on"
-            raise _FaultError(
-                f"the trajectory depends on earlier episodes: played again after others, with the same seed, context "
-                f"and actions, {what}. reset() must put back everything that an episode changes"
-            )
 
     def _check_neighbours(self, reference: Sequence[_Episode]) -> None:
         """The same episodes among others that run beside them, in other slots."""
         for order in ([0, 3, 1, 4, 2], [5, 2, 1, 6, 0, 7]):
-            env = self._make(len(order))
-            for k, found in zip(order, self._play(env, order), strict=True):
-                if k < N_EPISODES and found != reference[k]:
-                    raise _FaultError(
-                        "the trajectory depends on the neighbours in the batch: beside other episodes, with the same "
-                        "seed, context and actions, it is another one. Copies must share nothing that changes (class "
-                        "attributes, module globals, global random generators)"
-                    )
+            with self._opened(len(order)) as env:
+                for k, found in zip(order, self._play(env, order), strict=True):
+                    if k < N_EPISODES and found != reference[k]:
+                        raise _FaultError(
+                            "the trajectory depends on the neighbours in the batch: beside other episodes, with the "
+                            "same seed, context and actions, it is another one. Copies must share nothing that changes "
+                            "(class attributes, module globals, global random generators)"
+                        )
 
     def _check_contexts(self) -> None:
         """The same seed and actions in other contexts."""
@@ -234,8 +238,7 @@ class _Check:
 
     def _ask_gymnasium(self) -> None:
         """Gymnasium's own checker, on a copy that nothing was done to."""
-        env = self._single()
-        with warnings.catch_warnings(record=True) as told:
+        with self._single() as env, warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             try:
                 check_env(env, skip_render_check=True, skip_close_check=True)  # type: ignore[arg-type]
@@ -275,7 +278,8 @@ class _Check:
 
     def _alone(self, k: int, *, context: int | None = None, values: FloatArray | None = None) -> _Episode:
         """Episode k in a copy of its own, if need be in another context."""
-        return self._play(self._make(1), [k], context=context, values=values)[0]
+        with self._opened(1) as env:
+            return self._play(env, [k], context=context, values=values)[0]
 
     def _play(
         self, env: BatchedEnv, episodes: Sequence[int], *,
@@ -308,15 +312,23 @@ class _Check:
                 self._reset(env, ended, contexts[ended], self._seeds[chosen][ended])
         return [tuple(one) for one in told]
 
-    def _make(self, n_slots: int) -> BatchedEnv:
+    @contextlib.contextmanager
+    def _opened(self, n_slots: int) -> Iterator[BatchedEnv]:
+        """Another copy, closed behind the context."""
         try:
-            return make_batched(self._env_id, n_slots, context_visible=False, kwargs=self._kwargs)
+            env = make_batched(self._env_id, n_slots, context_visible=False, kwargs=self._kwargs)
         except ConfigError as error:
             raise _FaultError(str(error)) from None
+        try:
+            yield env
+        finally:
+            close(env)
 
-    def _single(self) -> gym.Env[Any, Any] | None:
-        env = self._make(1)
-        return env.first if isinstance(env, BatchedSingles) else None
+    @contextlib.contextmanager
+    def _single(self) -> Iterator[gym.Env[Any, Any] | None]:
+        """Another copy of a single environment."""
+        with self._opened(1) as env:
+            yield env.first if isinstance(env, BatchedSingles) else None
 
     def _reset(
         self, env: BatchedEnv, slots: NDArray[np.int64], contexts: FloatArray, seeds: NDArray[np.uint64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from space_dist.envs.observations import Observations
 from space_dist.instances import ContextBounds
+
+log = logging.getLogger("space_dist")
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -73,6 +76,18 @@ class Closable(Protocol):
 
     def close(self) -> None:
         """Free it. May be called twice; `reset` afterwards takes it anew."""
+
+
+def close(env: BatchedEnv) -> None:
+    """Have an environment free what it holds, if it holds anything; nobody uses it afterwards.
+
+    Somebody else's `close` may raise anything, and what is done with the environment is done: that is logged alone.
+    """
+    if isinstance(env, Closable):
+        try:
+            env.close()
+        except (Exception, SystemExit) as error:
+            log.warning("an environment cannot be closed: %s: %s", type(error).__name__, error)
 
 
 MakeBatched = Callable[[int], BatchedEnv]
@@ -137,6 +152,11 @@ class ContextVisible:
         step = self._env.step(actions)
         observations = self._with_context(step.observations, self._scaled.copy())
         return Step(observations, step.rewards, step.terminated, step.truncated, step.success)
+
+    def close(self) -> None:
+        """As the wrapped environment's, if it has one."""
+        if isinstance(self._env, Closable):
+            self._env.close()
 
     def _with_context(self, observations: Observations, context: NDArray[np.float32]) -> Observations:
         if isinstance(observations, dict):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -100,6 +101,13 @@ class BatchedSingles:
                 "gymnasium.Env whose render() returns (height, width, 3) with render_mode='rgb_array'"
             )
         return drawn.astype(np.uint8, copy=False)
+
+    def close(self) -> None:
+        """Close the environments of all slots, whatever one of them raises. `reset` afterwards makes new ones."""
+        envs, self._envs = self._envs, {}
+        with contextlib.ExitStack() as closing:
+            for env in envs.values():
+                closing.callback(env.close)
 
     def _another(self) -> gym.Env[Any, Any]:
         env = self._make()

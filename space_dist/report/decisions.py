@@ -14,17 +14,20 @@ from space_dist.config import FixedConfig, GrowingConfig, RoundRobinConfig, RunC
 from space_dist.curricula import Feedback, SetState
 from space_dist.curricula.variants import readings
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.instances import InstanceSet
+from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.ledger import CURRICULUM, METRICS, VALUES, Ledger, Row, decode_values
 
 _SHOWN = 12  # instances of a list or a table; the rest are counted
 
 
-def explain(ledger: Ledger, config: RunConfig, train: InstanceSet, iteration: int) -> list[str]:
+def explain(
+    ledger: Ledger, config: RunConfig, bounds: ContextBounds, train: InstanceSet, iteration: int
+) -> list[str]:  # fmt: skip
     """Lines 6 to 12 behind an iteration, counted from 1.
 
-    config, train: the run's. Raises ConfigError where nothing is decided about sets, or there is no such iteration;
-    LedgerError where the values of a decision are not there, or lead to another set than the run trained on.
+    config, train: the run's; bounds: of its contexts. Raises ConfigError where nothing is decided about sets, or there
+    is no such iteration; LedgerError where the values of a decision are not there, or lead to another set than the run
+    trained on.
     """
     settings = config.curriculum
     if not isinstance(settings, GrowingConfig | RoundRobinConfig | FixedConfig):
@@ -44,7 +47,7 @@ def explain(ledger: Ledger, config: RunConfig, train: InstanceSet, iteration: in
             f"{ledger.folder / VALUES} does not hold the start values of every decision up to iteration {iteration}: "
             "the run was begun by an earlier version, or its set is too large"
         )
-    curriculum = make_curriculum(config, train)
+    curriculum = make_curriculum(config, train, bounds)
     state, selection = curriculum.start()
     for row in decided[:iteration]:
         told = _feedback(scored, row)

@@ -13,6 +13,8 @@ import pytest
 
 from space_dist import config as configs
 from space_dist import ledger as ledgers
+from space_dist.building import spec_of
+from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.files import read_file
 from space_dist.interrupts import StopRequests
@@ -43,14 +45,14 @@ def original(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
         shutil.copytree(folder / "reference", folder / "run")
     ledger = Ledger(folder / "run")
     assert ledger.status().state == request.param
-    return config, folder / "run", results(folder / "reference"), read(ledger)
+    return config, folder / "run", results(folder / "reference"), read(ledger, spec_of(config))
 
 
-def read(ledger: Ledger) -> dict[str, Any]:
+def read(ledger: Ledger, spec: EnvironmentSpec) -> dict[str, Any]:
     """What `evaluate`, `report` and `sync` take from a run; a refusal is the sentence alone."""
 
     def policy() -> Any:
-        chosen = policy_of(ledger)
+        chosen = policy_of(ledger, spec)
         return [(name, array.tobytes()) for name, array in sorted(arrays_of(chosen))]
 
     def report() -> Any:
@@ -84,9 +86,9 @@ def files_of(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_READ)
 
 
-def readable_as_before_or_refused(folder: Path, before: dict[str, Any]) -> int:
+def readable_as_before_or_refused(folder: Path, spec: EnvironmentSpec, before: dict[str, Any]) -> int:
     """How many of the commands refused."""
-    now = read(Ledger(folder))
+    now = read(Ledger(folder), spec)
     for command, answer in now.items():
         if not isinstance(answer, SpaceDistError):
             assert answer == before[command], command
@@ -104,7 +106,8 @@ def resumes_to_the_same_bytes_or_is_refused(config: configs.RunConfig, folder: P
 
 def test_every_file_cut_short_and_changed(original: tuple[Any, Path, Any, Any], tmp_path: Path) -> None:
     """What a resumption reads is cut at every length in the interrupted run, the rest in the one that is done."""
-    _, folder, _, before = original
+    config, folder, _, before = original
+    spec = spec_of(config)
     copy, rng = tmp_path / "run", random.Random(0)
     shutil.copytree(folder, copy)
     ledger = Ledger(copy)
@@ -123,14 +126,14 @@ def test_every_file_cut_short_and_changed(original: tuple[Any, Path, Any, Any], 
                 cut += 1
             for length in rng.sample(lengths, 10):  # what commands make of it takes some ms
                 path.write_bytes(content[:length])
-                readable_as_before_or_refused(copy, before)
+                readable_as_before_or_refused(copy, spec, before)
             for _ in range(25):
                 at, change = rng.randrange(len(content)), rng.randrange(1, 256)
                 path.write_bytes(content[:at] + bytes([content[at] ^ change]) + content[at + 1 :])
-                readable_as_before_or_refused(copy, before)
+                readable_as_before_or_refused(copy, spec, before)
                 changed += 1
             path.write_bytes(content)
-    assert readable_as_before_or_refused(copy, before) == 0
+    assert readable_as_before_or_refused(copy, spec, before) == 0
     assert cut > 8_000
     assert changed >= 250  # in each of two runs
 

@@ -1,0 +1,109 @@
+"""What an environment is like, read once from one that is closed again: Acme's word for it is environment spec."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from space_dist.envs import BatchedEnv, close, make_batched
+from space_dist.envs.interface import FloatArray
+from space_dist.envs.observations import alike
+from space_dist.errors import ConfigError
+from space_dist.instances import ContextBounds
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """How an environment is made, and what it is like as a policy sees it. It holds nothing open, and can be pickled.
+
+    env_id, context_visible, kwargs: as for `make_batched`.
+    horizon: steps after which an episode is truncated.
+    observation_space, action_space: of one slot.
+    context_bounds: names and bounds of a context's features.
+
+    What takes an episode to know is a method, so that nobody pays for it who does not ask.
+    """
+
+    env_id: str
+    context_visible: bool
+    kwargs: Mapping[str, Any]
+    horizon: int
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    context_bounds: ContextBounds
+
+    def make(self, n_slots: int) -> BatchedEnv:
+        """A new environment, to be closed (`close`) by whoever asks for it."""
+        return make_batched(self.env_id, n_slots, context_visible=self.context_visible, kwargs=self.kwargs)
+
+    @contextlib.contextmanager
+    def opened(self, n_slots: int) -> Iterator[BatchedEnv]:
+        """A new environment for as long as the context lasts."""
+        env = self.make(n_slots)
+        try:
+            yield env
+        finally:
+            close(env)
+
+    def knows_success(self, contexts: FloatArray) -> bool:
+        """Whether a first step in a (1, d) context reports success, true or not.
+
+        Raises ConfigError if the environment fails.
+        """
+        with self._failures_explained("reset or a first step"), self.opened(1) as env:
+            env.action_space.seed(0)
+            env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
+            return env.step(np.asarray(env.action_space.sample())[None]).success is not None
+
+    def starts_alike(self, contexts: FloatArray) -> bool:
+        """Whether (n, d) contexts leave no trace in the first observation: with one seed, they all start the same.
+
+        A single one has nothing to be told from. Raises ConfigError if the environment fails.
+        """
+        n = len(contexts)
+        with self._failures_explained("reset"), self.opened(n) as env:
+            starts = env.reset(np.arange(n), contexts, np.zeros(n, dtype=np.uint64))
+        return n > 1 and alike(starts)
+
+    @contextlib.contextmanager
+    def _failures_explained(self, what: str) -> Iterator[None]:
+        """Somebody else's environment may raise anything."""
+        try:
+            yield
+        except ConfigError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise ConfigError(f"env.id {self.env_id!r}: {what} failed: {type(error).__name__}: {error}") from error
+
+
+def read_spec(
+    env_id: str, *, context_visible: bool, kwargs: Mapping[str, Any] = MappingProxyType({})
+) -> EnvironmentSpec:  # fmt: skip
+    """Look at an environment of one slot, and close it. Raises ConfigError as `make_batched` does."""
+    env = make_batched(env_id, 1, context_visible=context_visible, kwargs=kwargs)
+    try:
+        return EnvironmentSpec(
+            env_id, context_visible, dict(kwargs), env.horizon,
+            _of_gymnasium(env.observation_space), _of_gymnasium(env.action_space), env.context_bounds,
+        )  # fmt: skip
+    finally:
+        close(env)
+
+
+def _of_gymnasium(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """The same space, of a class of Gymnasium's: a user's own is not found where an actor unpickles its setup."""
+    if isinstance(space, spaces.Dict):
+        parts = [(name, _of_gymnasium(part)) for name, part in space.items()]
+        same = type(space) is spaces.Dict and all(part is space[name] for name, part in parts)
+        return space if same else spaces.Dict(parts)  # pairs keep their order, which is that of a network's inputs
+    if isinstance(space, spaces.Box) and type(space) is not spaces.Box:
+        return spaces.Box(space.low, space.high, dtype=space.low.dtype.type)
+    if isinstance(space, spaces.Discrete) and type(space) is not spaces.Discrete:
+        return spaces.Discrete(int(space.n), start=int(space.start))
+    return space
