@@ -39,8 +39,9 @@ class Section(BaseModel):
     """A part of a config: nothing unknown, nothing converted, nothing changed later."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True,
+        serialize_by_alias=True,
+    )  # fmt: skip
 
 
 def _refuse_library(value: str) -> str:
@@ -85,13 +86,23 @@ class _Curriculum(Section):
         return False
 
     @property
-    def probes(self) -> bool:
-        """Whether it runs probe episodes, whose steps cannot be foreseen."""
+    def may_probe(self) -> bool:
+        """Whether it may run probe episodes, whose steps cannot be foreseen."""
         return False
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def columns_read(self) -> tuple[str, ...]:
         """Columns of the training instances' CSV that it reads, beside id and features."""
+        return ()
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose arithmetic its decisions depend on, beside NumPy."""
+        return ()
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """Import paths of what somebody else has written."""
         return ()
 
 
@@ -232,7 +243,7 @@ class ManualConfig(GrowingConfig):
     """Highest first. Source: ours."""
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def columns_read(self) -> tuple[str, ...]:
         """See `_Curriculum`."""
         return (self.column,)
 
@@ -307,6 +318,11 @@ class SelfPacedConfig(_Curriculum):
         """See `_Curriculum`."""
         return not self.allow_context_blind
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return ("scipy",)
+
 
 class ValueDisagreementConfig(_Curriculum):
     """The VDS sampler (Zhang et al. 2020) under our learner: instances whose value an ensemble disagrees about.
@@ -365,6 +381,11 @@ class AlpGmmConfig(_Curriculum):
                              f"fit_rate must be at least components")  # fmt: skip
         return self
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return ("scipy", "scikit-learn")
+
 
 class LevelReplayConfig(_Curriculum):
     """Prioritised level replay (Jiang et al. 2021): by rank of mean |GAE|, and by how long ago. On-policy learners."""
@@ -403,9 +424,52 @@ class LearnabilityConfig(_Curriculum):
     """Probe episodes of each candidate, with the acting policy. Source: ours."""
 
     @property
-    def probes(self) -> bool:
+    def may_probe(self) -> bool:
         """See `_Curriculum`."""
         return True
+
+
+class CustomConfig(_Curriculum):
+    """A curriculum of your own: any that keeps the protocol (docs/your_curriculum.md)."""
+
+    kind: Literal["custom"]
+    """Which curriculum: your own."""
+    import_path: str = Field(alias="import", min_length=1, max_length=300)
+    """Import path (my_package.my_module:MyCurriculum) of a class derived from space_dist.curricula.Curriculum, or of a
+    function that makes one."""
+    kwargs: dict[str, bool | int | float | str] = {}
+    """Arguments of the class, by name, besides the instances, seed, draws and bounds, which come from the run."""
+    columns: tuple[Annotated[str, Field(min_length=1, max_length=100)], ...] = Field(
+        default=(), max_length=_MAX_LIST, strict=False
+    )
+    """Columns of instances.train that it reads, besides id and features: one number per instance, of any unit."""
+
+    @field_validator("import_path")
+    @classmethod
+    def _of_your_own(cls, value: str) -> str:
+        if not all(value.partition(":")):
+            raise ValueError("must be an import path with a colon, like my_package.my_module:MyCurriculum")
+        return _refuse_library(value)
+
+    @property
+    def may_probe(self) -> bool:
+        """See `_Curriculum`. What it wants is known once it is made."""
+        return True
+
+    @property
+    def columns_read(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return self.columns
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`. SciPy's kernels are looked at wherever results may depend on them."""
+        return ("scipy",)
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return (self.import_path,)
 
 
 CurriculumConfig = Annotated[
@@ -420,7 +484,8 @@ CurriculumConfig = Annotated[
     | ValueDisagreementConfig
     | AlpGmmConfig
     | LevelReplayConfig
-    | LearnabilityConfig,
+    | LearnabilityConfig
+    | CustomConfig,
     Field(discriminator="kind"),
 ]
 
@@ -840,6 +905,12 @@ class RunConfig(Section):
         return curriculum.policies if isinstance(curriculum, GrowingConfig) and curriculum.aggregate != "own" else 1
 
     @property
+    def import_paths(self) -> tuple[str, ...]:
+        """What names code of somebody's own, which results depend on as well: environment, policy and curriculum."""
+        named = (self.env.id, self.learner.policy, *self.curriculum.import_paths)
+        return tuple(path for path in named if ":" in path)
+
+    @property
     def n_episodes(self) -> int | None:
         """Episodes per round, where rounds end by episodes."""
         return None if isinstance(self.learner, _OnPolicy) else self.learner.n_episodes
@@ -1125,7 +1196,7 @@ def _explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[st
     kind, given = fault["type"], fault.get("input")
     context = fault.get("ctx", {})
     if kind == "extra_forbidden":
-        allowed = list(model.model_fields) if model else []
+        allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {key}: this key is required"
@@ -1179,9 +1250,14 @@ def _models(field: Any) -> list[type[BaseModel]]:
             if isinstance(annotation, type) and issubclass(annotation, BaseModel)]  # fmt: skip
 
 
+def _key(name: str, field: Any) -> str:
+    """What a config calls a field."""
+    return str(field.alias or name)
+
+
 def _describe(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str, str, str]]:
     for name, field in model.model_fields.items():
-        key, inner = f"{prefix}{name}", _models(field)
+        key, inner = f"{prefix}{_key(name, field)}", _models(field)
         if not inner:
             default = "required" if field.is_required() else json.dumps(field.get_default(), default=str)
             yield key, _type_name(field), default, " ".join((field.description or "").split())
@@ -1199,7 +1275,7 @@ def _type_name(field: Any) -> str:
               for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
               if hasattr(item, attribute)]  # fmt: skip
     if name.startswith("tuple"):
-        name = "list of int"
+        name = f"list of {re.findall(r'int|float|str', name)[0]}"
     return " ".join([name, *limits])
 
 

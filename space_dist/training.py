@@ -137,7 +137,7 @@ def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
             f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
             f"compute. Allowed learners: {', '.join(ON_POLICY)}"
         )
-    if config.curriculum.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
+    if curriculum.wants.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
         raise ConfigError(
             f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
             "not say (its steps have no `success`)"
@@ -394,10 +394,10 @@ class Training:
         There are none where they, at their longest, would leave no room for another round.
         """
         run, cluster = self._run, self._cluster
-        if not self._config.curriculum.probes:
+        if not self._curriculum.wants.probes:
             return []
         (state,) = yield from self._settle([run.state])
-        indices = self._curriculum.probes(state, joined_episodes(run.seen))
+        indices = self._curriculum.probes(state, joined_episodes(run.seen) if run.seen else None)
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
         outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))
@@ -725,7 +725,7 @@ def total_steps(config: RunConfig, horizon: int) -> int:
 
     The budget, where rounds end by episodes or probes come between them.
     """
-    if config.n_episodes is not None or config.curriculum.probes:
+    if config.n_episodes is not None or config.curriculum.may_probe:
         return config.budget.steps
     return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
 

@@ -576,7 +576,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
         options = [option for option in (get_args(field.annotation) or (field.annotation,))
                    if isinstance(option, type) and issubclass(option, BaseModel)]  # fmt: skip
         if not options:
-            yield f"{prefix}{name}"
+            yield f"{prefix}{field.alias or name}"
         for option in options:
             yield from keys(option, f"{prefix}{name}.")
 
@@ -611,7 +611,9 @@ def kinds(section: str) -> list[str]:
     return [get_args(option.model_fields["kind"].annotation)[0] for option in options]
 
 
-NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"}}  # what a kind cannot do without
+# What a kind cannot do without.
+NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"},
+                          "custom": {"import": "my_package.my_module:Mine"}}  # fmt: skip
 CONFIGS = {path.stem: load(path) for path in SHIPPED}
 CONFIGS |= {f"{section}_{kind}": load(SPACE, [f"{section}={json.dumps({'kind': kind, **NEEDED.get(kind, {})})}"])
             for section in ("learner", "curriculum") for kind in kinds(section)}  # fmt: skip
@@ -625,6 +627,7 @@ OTHER_WORDS = {
     "tracking.experiment": "another",
     "resources.address": "auto",
     "curriculum.column": "effort",
+    "curriculum.import": "my_package.my_module:Other",
 }
 # What decides no result, and so is no part of a run's identity: when it is saved, where it is mirrored, what it runs
 # on, and where its instance files lie (their content enters by digest).
@@ -657,7 +660,9 @@ def annotation(config: RunConfig, key: str) -> Any:
     *parents, last = key.split(".")
     for part in parents:
         section = getattr(section, part)
-    return type(section).model_fields[last].annotation if isinstance(section, BaseModel) else Any  # env.kwargs
+    if not isinstance(section, BaseModel):  # env.kwargs
+        return Any
+    return next(field.annotation for name, field in type(section).model_fields.items() if last in (name, field.alias))
 
 
 def words_in(annotation: Any) -> list[str]:
@@ -673,7 +678,7 @@ def candidates(config: RunConfig, key: str, value: Any) -> list[Any]:
     if isinstance(value, int | float):
         return [value * 2 or 1, value / 2 or 0.5, *words]
     if isinstance(value, list):
-        return [[32, 32]]
+        return [[32, 32], ["effort"]]
     return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1, [0.5, 0.5], ["a"]]
 
 

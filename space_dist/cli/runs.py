@@ -88,7 +88,7 @@ def evaluate(
     state = "abandoned" if ledger.abandoned(status) else status.state
     config = stored_config(ledger)
     policies = members_of(policy_of(ledger))
-    chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns, if_there=True)
+    chosen = read_csv(instances, make_env(config).context_bounds, config.curriculum.columns_read, if_there=True)
     env = make_env(config, len(chosen))
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     with exits_refused():
@@ -137,7 +137,7 @@ def explain(
     ledger.status()
     config = stored_config(ledger)
     ledger.read(ledger.instances("train"))
-    train = read_csv(ledger.instances("train"), make_env(config).context_bounds, config.curriculum.columns)
+    train = read_csv(ledger.instances("train"), make_env(config).context_bounds, config.curriculum.columns_read)
     for line in explain_decision(ledger, config, train, iteration):
         print(line)
     delivered()
