@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.cluster import Cluster, InProcess
-from space_dist.config import PPOConfig, RunConfig
+from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.errors import (
     ConfigError,
@@ -240,8 +240,7 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
 
 def _also_decide(config: RunConfig) -> list[str]:
     """The distributions whose arithmetic this run uses, besides those that every run does."""
-    ppo = isinstance(config.learner, PPOConfig)
-    compiled = ppo and (config.engine == "population" or getattr(config.learner, "update", "") == "lean")
+    compiled = config.learner.is_compiled(config.engine)
     also = {
         "scikit-learn": "scikit-learn" in config.curriculum.libraries,
         "pybullet": config.env.id in BULLET_IDS,

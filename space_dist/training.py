@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
-from space_dist.config import GrowingConfig, PPOConfig, RunConfig, TRPOConfig
+from space_dist.config import RunConfig, learners_that
 from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.observations import alike
@@ -47,7 +47,6 @@ from space_dist.learner import (
     CoupledLearner,
     Ensemble,
     Learner,
-    PopulationLearner,
     Update,
     make_ensemble,
     make_learner,
@@ -76,7 +75,6 @@ from space_dist.walk import Unfinished, Walk, stacked, unstacked
 
 log = logging.getLogger("space_dist")
 
-ON_POLICY = ("ppo", "trpo", "a2c")
 PROBE = (1 << 32) - 1  # the round in which first scales are measured
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
 
@@ -98,7 +96,7 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
         test=test,
         env_kwargs=config.env.kwargs,
         episodes_per_round=config.n_episodes,
-        keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
+        keep_next_observations=config.learner.keeps_next_observations,
         members=config.members,
     )
     probes = config.learner.normalize_observations or config.learner.normalize_rewards
@@ -131,11 +129,11 @@ def make_setup(config: RunConfig, train: InstanceSet, test: InstanceSet) -> Setu
 
 def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
     """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
-    kind, learner = config.curriculum.kind, config.learner.kind
-    if curriculum.wants.advantages and learner not in ON_POLICY:
+    kind = config.curriculum.kind
+    if curriculum.wants.advantages and not config.learner.has_advantages:
         raise ConfigError(
-            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
-            f"compute. Allowed learners: {', '.join(ON_POLICY)}"
+            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {config.learner.kind} "
+            f"does not compute. Allowed learners: {', '.join(learners_that('has_advantages'))}"
         )
     if curriculum.wants.probes and not _knows_success(config, curriculum.start()[1].contexts[:1]):
         raise ConfigError(
@@ -235,7 +233,7 @@ class Wait:
 class Learn:
     """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
 
-    learner: Learner | CoupledLearner
+    learner: Learner
     shards: list[Shard]
     round: int
     steps: int
@@ -408,9 +406,8 @@ class Training:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
         rescored, members, episodes, context_values = [], [], [], []
-        growing = self._config.curriculum
-        from_zero = run.version == 0 and isinstance(growing, GrowingConfig) and growing.v0 == "zero"
-        if isinstance(self.learner, Learner) and self.learner.normalises and not from_zero:
+        from_zero = run.version == 0 and self._config.curriculum.starts_from_zero
+        if self.learner.normalises and not from_zero:
             # Both values at one scale: else a change of scale would look like progress.
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         if self.ensemble is not None:
@@ -696,7 +693,7 @@ class Training:
         if self.ensemble is not None:
             self.ensemble.load(_under("ensemble/", arrays))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
-        if (acted := _under("acted/", arrays)) and isinstance(self.learner, Learner):
+        if acted := _under("acted/", arrays):
             run.acted = acted
             run.ahead = self._collect(cluster.put(self.learner.policy_of(acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
@@ -734,7 +731,7 @@ def resolved(config: RunConfig, *, can_share: bool = True) -> RunConfig:
     """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
     if config.engine != "auto":
         return config
-    stock = getattr(config.learner, "update", "stock") == "stock"
+    stock = not config.learner.is_compiled("single")
     env, engine = make_env(config), "population" if can_share and stock and not config.rollout.overlap else "single"
     try:
         refuse_population(config.learner, env.observation_space, env.action_space)
@@ -758,19 +755,19 @@ def stack_of(config: RunConfig) -> str:
 
 def memory_of(config: RunConfig) -> int:
     """About what a run takes of the memory of the process that it shares, in MB; 0 for a run that works alone."""
-    if config.engine != "population" or not isinstance(config.learner, PPOConfig | TRPOConfig):
+    if config.engine != "population" or not config.learner.can_be_stacked:
         return 0
     env = make_env(config)
     each = member_bytes(config.learner, env.observation_space, env.action_space, config.device)
     return -(-config.members * each >> 20)
 
 
-def learner_of(config: RunConfig) -> Learner | CoupledLearner:
+def learner_of(config: RunConfig) -> Learner:
     """A config's learner with its initial networks."""
     if config.members == 1:
         return _learner_of(config, config.seed)
     members = [_learner_of(config, int(seed)) for seed in member_seeds(config.seed, config.members)]
-    return CoupledLearner([member for member in members if isinstance(member, PopulationLearner)])
+    return CoupledLearner([one for member in members for one in member.members])
 
 
 def _learner_of(config: RunConfig, seed: int) -> Learner:
@@ -796,20 +793,19 @@ def policy_in(checkpoint: Checkpoint, config: RunConfig) -> Policy | Several:
     return learner.policy(checkpoint.round)
 
 
-def model_of(learner: Learner | CoupledLearner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def model_of(learner: Learner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """A trained policy as arrays and a description: layer by layer, or as torch's state where NumPy cannot act."""
     policy = learner.policy(version)
     if isinstance(policy, MlpPolicy):
         return to_arrays(policy)
     arrays = learner.scored()
-    first = learner.members[0] if isinstance(learner, CoupledLearner) else learner
     return arrays, {
-        "format": 2, "version": version, "policy": "torch", "class": str(type(first.model.policy)),
+        "format": 2, "version": version, "policy": "torch", "class": learner.policy_name,
         "shapes": {name: list(array.shape) for name, array in arrays.items()},
     }  # fmt: skip
 
 
-def _load_learner(learner: Learner | CoupledLearner, checkpoint: Checkpoint) -> None:
+def _load_learner(learner: Learner, checkpoint: Checkpoint) -> None:
     learner.load(_under("learner/", checkpoint.arrays), checkpoint.data["learner"])
 
 

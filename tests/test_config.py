@@ -794,3 +794,21 @@ def test_tracking_uris_that_could_not_be_mirrored_to_are_refused_and_no_password
     assert "sqlite:////absolute/path/mlflow.db" in text
     assert "secret" not in str(caught.value)
     assert ("MLFLOW_TRACKING_PASSWORD" in text) == ("http" in uri and "secret" in uri and "[" not in uri)
+
+
+def test_learners_say_what_they_can_do() -> None:
+    found = {ability: configs.learners_that(ability) for ability in
+             ("has_advantages", "keeps_next_observations", "can_be_stacked")}  # fmt: skip
+    assert found == {
+        "has_advantages": ["ppo", "trpo", "a2c"],
+        "keeps_next_observations": ["dqn", "sac", "td3"],
+        "can_be_stacked": ["ppo", "trpo"],
+    }
+    actions = {kind: CONFIGS[f"learner_{kind}"].learner.actions for kind in kinds("learner")}
+    assert {kind: what for kind, what in actions.items() if what != "any"} == {
+        "dqn": "discrete", "sac": "bounded", "td3": "bounded",
+    }  # fmt: skip
+    compiled = [(update, engine) for update in ("stock", "lean") for engine in ("single", "population")
+                if load(SPACE, [f"learner.update={update}"]).learner.is_compiled(engine)]  # fmt: skip
+    assert compiled == [("stock", "population"), ("lean", "single"), ("lean", "population")]
+    assert not CONFIGS["learner_trpo"].learner.is_compiled("population")
