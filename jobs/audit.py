@@ -230,7 +230,8 @@ def audit(run: Run) -> int:
     settings, n, ties = run.curriculum, len(run.ids), keys_of(run, TIES)
     kind = settings["kind"]
     if kind not in (*GROWING, *PASSED_OVER):
-        raise NotAuditableError(f"curriculum.kind: {kind} draws its instances; decisions on sets are made again only")
+        what = "chooses by rules of its own" if kind == "custom" else "draws its instances"
+        raise NotAuditableError(f"curriculum.kind: {kind} {what}; decisions on sets are made again only")
     if kind in PASSED_OVER:
         chosen = np.argsort(ties)
         if settings.get("ids") is not None:

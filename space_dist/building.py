@@ -8,7 +8,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from space_dist.cluster import make_curriculum
-from space_dist.config import PPOConfig, RunConfig, TRPOConfig
+from space_dist.config import RunConfig, learners_that
 from space_dist.curricula import Curriculum
 from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError
@@ -17,7 +17,6 @@ from space_dist.learner import (
     CoupledLearner,
     Ensemble,
     Learner,
-    PopulationLearner,
     make_ensemble,
     make_learner,
     member_bytes,
@@ -30,7 +29,6 @@ from space_dist.policy import MlpPolicy, Policy, Several, to_arrays
 from space_dist.rollout import Setup
 from space_dist.seeding import member_seeds
 
-ON_POLICY = ("ppo", "trpo", "a2c")
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
 
 
@@ -53,7 +51,7 @@ def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, tes
         train=train,
         test=test,
         episodes_per_round=config.n_episodes,
-        keep_next_observations=config.learner.kind in ("dqn", "sac", "td3"),
+        keep_next_observations=config.learner.keeps_next_observations,
         members=config.members,
     )
     probes = config.learner.normalize_observations or config.learner.normalize_rewards
@@ -85,13 +83,13 @@ def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, tes
 
 def _refuse_wants(config: RunConfig, spec: EnvironmentSpec, curriculum: Curriculum) -> None:
     """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
-    kind, learner = config.curriculum.kind, config.learner.kind
-    if curriculum.wants.advantages and learner not in ON_POLICY:
+    kind = config.curriculum.kind
+    if curriculum.wants.advantages and not config.learner.has_advantages:
         raise ConfigError(
-            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {learner} does not "
-            f"compute. Allowed learners: {', '.join(ON_POLICY)}"
+            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {config.learner.kind} "
+            f"does not compute. Allowed learners: {', '.join(learners_that('has_advantages'))}"
         )
-    if config.curriculum.probes and not spec.knows_success(curriculum.start()[1].contexts[:1]):
+    if curriculum.wants.probes and not spec.knows_success(curriculum.start()[1].contexts[:1]):
         raise ConfigError(
             f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
             "not say (its steps have no `success`)"
@@ -103,7 +101,7 @@ def total_steps(config: RunConfig, horizon: int) -> int:
 
     The budget, where rounds end by episodes or probes come between them.
     """
-    if config.n_episodes is not None or config.curriculum.probes:
+    if config.n_episodes is not None or config.curriculum.may_probe:
         return config.budget.steps
     return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
 
@@ -112,7 +110,7 @@ def resolved(config: RunConfig, spec: EnvironmentSpec, *, can_share: bool = True
     """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
     if config.engine != "auto":
         return config
-    stock = getattr(config.learner, "update", "stock") == "stock"
+    stock = not config.learner.is_compiled("single")
     engine = "population" if can_share and stock and not config.rollout.overlap else "single"
     try:
         refuse_population(config.learner, spec.observation_space, spec.action_space)
@@ -135,18 +133,18 @@ def stack_of(config: RunConfig, spec: EnvironmentSpec) -> str:
 
 def memory_of(config: RunConfig, spec: EnvironmentSpec) -> int:
     """About what a run takes of the memory of the process that it shares, in MB; 0 for a run that works alone."""
-    if config.engine != "population" or not isinstance(config.learner, PPOConfig | TRPOConfig):
+    if config.engine != "population" or not config.learner.can_be_stacked:
         return 0
     each = member_bytes(config.learner, spec.observation_space, spec.action_space, config.device)
     return -(-config.members * each >> 20)
 
 
-def learner_of(config: RunConfig, spec: EnvironmentSpec) -> Learner | CoupledLearner:
+def learner_of(config: RunConfig, spec: EnvironmentSpec) -> Learner:
     """A config's learner with its initial networks."""
     if config.members == 1:
         return _learner_of(config, spec, config.seed)
     members = [_learner_of(config, spec, int(seed)) for seed in member_seeds(config.seed, config.members)]
-    return CoupledLearner([member for member in members if isinstance(member, PopulationLearner)])
+    return CoupledLearner([one for member in members for one in member.members])
 
 
 def _learner_of(config: RunConfig, spec: EnvironmentSpec, seed: int) -> Learner:
@@ -170,19 +168,18 @@ def policy_in(checkpoint: Checkpoint, config: RunConfig, spec: EnvironmentSpec) 
     return learner.policy(checkpoint.round)
 
 
-def model_of(learner: Learner | CoupledLearner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def model_of(learner: Learner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """A trained policy as arrays and a description: layer by layer, or as torch's state where NumPy cannot act."""
     policy = learner.policy(version)
     if isinstance(policy, MlpPolicy):
         return to_arrays(policy)
     arrays = learner.scored()
-    first = learner.members[0] if isinstance(learner, CoupledLearner) else learner
     return arrays, {
-        "format": 2, "version": version, "policy": "torch", "class": str(type(first.model.policy)),
+        "format": 2, "version": version, "policy": "torch", "class": learner.policy_name,
         "shapes": {name: list(array.shape) for name, array in arrays.items()},
     }  # fmt: skip
 
 
-def load_learner(learner: Learner | CoupledLearner, checkpoint: Checkpoint) -> None:
+def load_learner(learner: Learner, checkpoint: Checkpoint) -> None:
     """Bring a learner to where it was when a checkpoint was written."""
     learner.load(checkpoint.under("learner/"), checkpoint.data["learner"])

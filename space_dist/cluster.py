@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from space_dist.config import GrowingConfig, RunConfig
+from space_dist.config import RunConfig
 from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, Selection, State
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
@@ -99,7 +99,7 @@ class Central:
 
     def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
         self.curriculum = make_curriculum(config, train, bounds)
-        self._from_zero = isinstance(config.curriculum, GrowingConfig) and config.curriculum.v0 == "zero"
+        self._from_zero = config.curriculum.starts_from_zero
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
         """The first decision and V_0."""

@@ -12,7 +12,7 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
@@ -39,8 +39,9 @@ class Section(BaseModel):
     """A part of a config: nothing unknown, nothing converted, nothing changed later."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True,
+        serialize_by_alias=True,
+    )  # fmt: skip
 
 
 def _refuse_library(value: str) -> str:
@@ -85,13 +86,33 @@ class _Curriculum(Section):
         return False
 
     @property
-    def probes(self) -> bool:
-        """Whether it runs probe episodes, whose steps cannot be foreseen."""
+    def starts_from_zero(self) -> bool:
+        """Whether start values before the first update count as 0."""
         return False
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def policies_trained(self) -> int:
+        """How many policies share the selection."""
+        return 1
+
+    @property
+    def may_probe(self) -> bool:
+        """Whether it may run probe episodes, whose steps cannot be foreseen."""
+        return False
+
+    @property
+    def columns_read(self) -> tuple[str, ...]:
         """Columns of the training instances' CSV that it reads, beside id and features."""
+        return ()
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose arithmetic its decisions depend on, beside NumPy."""
+        return ()
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """Import paths of what somebody else has written."""
         return ()
 
 
@@ -127,6 +148,16 @@ class GrowingConfig(_Curriculum):
     policies: int = Field(default=4, ge=2, le=64)
     """With aggregate: population, how many. Each collects learner.n_steps steps an update, and passes over the whole
     selection; all count in the budget."""
+
+    @property
+    def starts_from_zero(self) -> bool:
+        """See `_Curriculum`."""
+        return self.v0 == "zero"
+
+    @property
+    def policies_trained(self) -> int:
+        """See `_Curriculum`."""
+        return 1 if self.aggregate == "own" else self.policies
 
     @model_validator(mode="after")
     def _growth_is_possible(self) -> Self:
@@ -232,7 +263,7 @@ class ManualConfig(GrowingConfig):
     """Highest first. Source: ours."""
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def columns_read(self) -> tuple[str, ...]:
         """See `_Curriculum`."""
         return (self.column,)
 
@@ -307,6 +338,11 @@ class SelfPacedConfig(_Curriculum):
         """See `_Curriculum`."""
         return not self.allow_context_blind
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return ("scipy",)
+
 
 class ValueDisagreementConfig(_Curriculum):
     """The VDS sampler (Zhang et al. 2020) under our learner: instances whose value an ensemble disagrees about.
@@ -365,6 +401,11 @@ class AlpGmmConfig(_Curriculum):
                              f"fit_rate must be at least components")  # fmt: skip
         return self
 
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return ("scipy", "scikit-learn")
+
 
 class LevelReplayConfig(_Curriculum):
     """Prioritised level replay (Jiang et al. 2021): by rank of mean |GAE|, and by how long ago. On-policy learners."""
@@ -403,9 +444,52 @@ class LearnabilityConfig(_Curriculum):
     """Probe episodes of each candidate, with the acting policy. Source: ours."""
 
     @property
-    def probes(self) -> bool:
+    def may_probe(self) -> bool:
         """See `_Curriculum`."""
         return True
+
+
+class CustomConfig(_Curriculum):
+    """A curriculum of your own: any that keeps the protocol (docs/your_curriculum.md)."""
+
+    kind: Literal["custom"]
+    """Which curriculum: your own."""
+    import_path: str = Field(alias="import", min_length=1, max_length=300)
+    """Import path (my_package.my_module:MyCurriculum) of a class derived from space_dist.curricula.Curriculum, or of a
+    function that makes one."""
+    kwargs: dict[str, bool | int | float | str] = {}
+    """Arguments of the class, by name, besides the instances, seed, draws and bounds, which come from the run."""
+    columns: tuple[Annotated[str, Field(min_length=1, max_length=100)], ...] = Field(
+        default=(), max_length=_MAX_LIST, strict=False
+    )
+    """Columns of instances.train that it reads, besides id and features: one number per instance, of any unit."""
+
+    @field_validator("import_path")
+    @classmethod
+    def _of_your_own(cls, value: str) -> str:
+        if not all(value.partition(":")):
+            raise ValueError("must be an import path with a colon, like my_package.my_module:MyCurriculum")
+        return _refuse_library(value)
+
+    @property
+    def may_probe(self) -> bool:
+        """See `_Curriculum`. What it wants is known once it is made."""
+        return True
+
+    @property
+    def columns_read(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return self.columns
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`. SciPy's kernels are looked at wherever results may depend on them."""
+        return ("scipy",)
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return (self.import_path,)
 
 
 CurriculumConfig = Annotated[
@@ -420,12 +504,22 @@ CurriculumConfig = Annotated[
     | ValueDisagreementConfig
     | AlpGmmConfig
     | LevelReplayConfig
-    | LearnabilityConfig,
+    | LearnabilityConfig
+    | CustomConfig,
     Field(discriminator="kind"),
 ]
 
 
 class _Learner(Section):
+    has_advantages: ClassVar[bool] = False
+    """Whether an update tells the advantages of the transitions it is made of."""
+    keeps_next_observations: ClassVar[bool] = False
+    """Whether it is off-policy: it learns from a replay buffer, which holds what each step led to."""
+    can_be_stacked: ClassVar[bool] = False
+    """Whether updates of several can be computed together (engine: population)."""
+    actions: ClassVar[Literal["any", "discrete", "bounded"]] = "any"
+    """What it chooses among. bounded: numbers within bounds. any: numbers, with bounds or without, or one of a few."""
+
     policy: str = Field(default="MlpPolicy", min_length=1, max_length=300)
     """SB3's MlpPolicy (acts in NumPy, without torch), CnnPolicy (images), MultiInputPolicy (dictionaries), or the
     import path of a policy class (my_package.my_module:MyPolicy)."""
@@ -452,8 +546,23 @@ class _Learner(Section):
             )
         return _refuse_library(value)
 
+    @property
+    def episodes_per_round(self) -> int | None:
+        """Episodes that end a round, where steps do not."""
+        return None
+
+    def policy_settings(self) -> dict[str, Any]:
+        """What SB3's policies of this kind are made with, besides layers and their activation."""
+        return {}
+
+    def is_compiled(self, engine: str) -> bool:  # noqa: ARG002 - some are not with any
+        """Whether its updates are a compiled function of ours with this engine, where they are computed on a CPU."""
+        return False
+
 
 class _OnPolicy(_Learner):
+    has_advantages: ClassVar[bool] = True
+
     n_steps: int = Field(default=2048, ge=2)
     """Environment transitions per update, over all shards and slots; the same constant for every curriculum. Source:
     SB3's PPO (2048); sb3-contrib's TRPO and the released SPaCE code on PointMass differ (2048 and 1024)."""
@@ -468,10 +577,15 @@ class _OnPolicy(_Learner):
     log_std_init: float = 0.0
     """Natural logarithm of the initial standard deviation of continuous actions, in action units. Source: SB3."""
 
+    def policy_settings(self) -> dict[str, Any]:
+        """See `_Learner`."""
+        return {"log_std_init": self.log_std_init}
+
 
 class PPOConfig(_OnPolicy):
     """Stable-Baselines3 PPO."""
 
+    can_be_stacked: ClassVar[bool] = True
     kind: Literal["ppo"]
     """Which learner: PPO."""
     batch_size: int = Field(default=64, ge=2)
@@ -499,10 +613,15 @@ class PPOConfig(_OnPolicy):
             raise ValueError(f"update: lean knows MlpPolicy only, not {self.policy}; allowed with it: stock")
         return self
 
+    def is_compiled(self, engine: str) -> bool:
+        """See `_Learner`."""
+        return engine == "population" or self.update == "lean"
+
 
 class TRPOConfig(_OnPolicy):
     """sb3-contrib TRPO."""
 
+    can_be_stacked: ClassVar[bool] = True
     kind: Literal["trpo"]
     """Which learner: TRPO."""
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -545,6 +664,8 @@ class A2CConfig(_OnPolicy):
 
 
 class _OffPolicy(_Learner):
+    keeps_next_observations: ClassVar[bool] = True
+
     n_steps: int = Field(default=512, ge=1)
     """Environment transitions per round, over all shards and slots, collected with the policy of the round before:
     SB3's train_freq."""
@@ -565,10 +686,16 @@ class _OffPolicy(_Learner):
     tau: float = Field(default=0.005, gt=0.0, le=1.0)
     """Share of the online network that enters the target network per update. Source: SB3's SAC and TD3."""
 
+    @property
+    def episodes_per_round(self) -> int | None:
+        """See `_Learner`."""
+        return self.n_episodes
+
 
 class DQNConfig(_OffPolicy):
     """Stable-Baselines3 DQN (Huber loss, linear epsilon)."""
 
+    actions: ClassVar[Literal["any", "discrete", "bounded"]] = "discrete"
     kind: Literal["dqn"]
     """Which learner: DQN."""
     learning_rate: float = Field(default=1e-4, gt=0.0)
@@ -597,6 +724,7 @@ class DQNConfig(_OffPolicy):
 class SACConfig(_OffPolicy):
     """Stable-Baselines3 SAC. Its start values contain the entropy bonus."""
 
+    actions: ClassVar[Literal["any", "discrete", "bounded"]] = "bounded"
     kind: Literal["sac"]
     """Which learner: SAC."""
     learning_rate: float = Field(default=3e-4, gt=0.0)
@@ -619,6 +747,7 @@ class SACConfig(_OffPolicy):
 class TD3Config(_OffPolicy):
     """Stable-Baselines3 TD3."""
 
+    actions: ClassVar[Literal["any", "discrete", "bounded"]] = "bounded"
     kind: Literal["td3"]
     """Which learner: TD3."""
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -639,6 +768,13 @@ class TD3Config(_OffPolicy):
 LearnerConfig = Annotated[
     PPOConfig | TRPOConfig | A2CConfig | DQNConfig | SACConfig | TD3Config, Field(discriminator="kind")
 ]
+
+
+def learners_that(ability: Literal["has_advantages", "keeps_next_observations", "can_be_stacked"]) -> list[str]:
+    """The kinds of learners that can do something, for sentences."""
+    sections: tuple[type[_Learner], ...] = get_args(get_args(LearnerConfig)[0])
+    able = (section for section in sections if getattr(section, ability))
+    return [get_args(section.model_fields["kind"].annotation)[0] for section in able]
 
 
 class RolloutConfig(Section):
@@ -771,7 +907,7 @@ class RunConfig(Section):
     def _overlap_is_possible(self) -> Self:
         if not self.rollout.overlap:
             return self
-        if not isinstance(self.learner, _OnPolicy):
+        if self.learner.keeps_next_observations:
             raise ValueError(
                 f"rollout.overlap: true: learner.kind: {self.learner.kind} is off-policy, and learns from older rounds "
                 "anyway; it works with ppo, trpo and a2c"
@@ -802,7 +938,7 @@ class RunConfig(Section):
     def _population_shares_a_curriculum(self) -> Self:
         if self.members == 1:
             return self
-        if self.engine == "single" or not isinstance(self.learner, PPOConfig | TRPOConfig):
+        if self.engine == "single" or not self.learner.can_be_stacked:
             raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo or trpo")
         if self.learner.normalize_observations or self.learner.normalize_rewards:
             raise ValueError(
@@ -836,13 +972,18 @@ class RunConfig(Section):
     @property
     def members(self) -> int:
         """Policies that the run trains."""
-        curriculum = self.curriculum
-        return curriculum.policies if isinstance(curriculum, GrowingConfig) and curriculum.aggregate != "own" else 1
+        return self.curriculum.policies_trained
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """What names code of somebody's own, which results depend on as well: environment, policy and curriculum."""
+        named = (self.env.id, self.learner.policy, *self.curriculum.import_paths)
+        return tuple(path for path in named if ":" in path)
 
     @property
     def n_episodes(self) -> int | None:
         """Episodes per round, where rounds end by episodes."""
-        return None if isinstance(self.learner, _OnPolicy) else self.learner.n_episodes
+        return self.learner.episodes_per_round
 
     def slot_length(self, horizon: int) -> int:
         """Transitions per slot and round; the most there can be, where rounds end by episodes."""
@@ -1125,7 +1266,7 @@ def _explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[st
     kind, given = fault["type"], fault.get("input")
     context = fault.get("ctx", {})
     if kind == "extra_forbidden":
-        allowed = list(model.model_fields) if model else []
+        allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {key}: this key is required"
@@ -1179,9 +1320,14 @@ def _models(field: Any) -> list[type[BaseModel]]:
             if isinstance(annotation, type) and issubclass(annotation, BaseModel)]  # fmt: skip
 
 
+def _key(name: str, field: Any) -> str:
+    """What a config calls a field."""
+    return str(field.alias or name)
+
+
 def _describe(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str, str, str]]:
     for name, field in model.model_fields.items():
-        key, inner = f"{prefix}{name}", _models(field)
+        key, inner = f"{prefix}{_key(name, field)}", _models(field)
         if not inner:
             default = "required" if field.is_required() else json.dumps(field.get_default(), default=str)
             yield key, _type_name(field), default, " ".join((field.description or "").split())
@@ -1199,7 +1345,7 @@ def _type_name(field: Any) -> str:
               for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
               if hasattr(item, attribute)]  # fmt: skip
     if name.startswith("tuple"):
-        name = "list of int"
+        name = f"list of {re.findall(r'int|float|str', name)[0]}"
     return " ".join([name, *limits])
 
 

@@ -76,13 +76,11 @@ log = logging.getLogger("space_dist")
 def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[str, ...]:
     """What decides the bits that an actor computes, as `computed` knows it, beside those of the environment itself."""
     if central:
-        also = {"scipy": config.curriculum.kind in ("spdrl", "alp_gmm"),
-                "scikit-learn": config.curriculum.kind == "alp_gmm"}  # fmt: skip
-    else:
-        from space_dist.learner import is_mlp  # torch, which actors of such policies never import
+        return ("numpy", *config.curriculum.libraries)
+    from space_dist.learner import is_mlp  # torch, which actors of such policies never import
 
-        also = {"torch": not is_mlp(config.learner, setup.spec.observation_space),
-                "pybullet": config.env.id in BULLET_IDS}  # fmt: skip
+    also = {"torch": not is_mlp(config.learner, setup.spec.observation_space),
+            "pybullet": config.env.id in BULLET_IDS}  # fmt: skip
     return ("numpy", *(name for name, used in also.items() if used))
 
 
@@ -135,9 +133,13 @@ class RolloutActor(_Timed, Worker):
 
 
 class CurriculumActor(_Timed, Central):
-    """The central curriculum: aggregates the start values that all rollout actors send it, and decides."""
+    """The central curriculum: aggregates the start values that all rollout actors send it, and decides.
 
-    def __init__(self, config: RunConfig, setup: Setup) -> None:
+    folders: as `RolloutActor`'s.
+    """
+
+    def __init__(self, config: RunConfig, setup: Setup, folders: Sequence[str]) -> None:
+        look_in(folders)
         threadpool_limits(limits=1)
         super().__init__(config, setup.train, setup.spec.context_bounds)
 
@@ -420,7 +422,7 @@ class RayCluster:
                 options["runtime_env"] = {"env_vars": chosen}
             setup = self._setup_piece.ref
             self._actors[seat] = (
-                ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup)
+                ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup, folders_of_user())
                 if seat == _CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )

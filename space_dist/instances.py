@@ -17,7 +17,7 @@ from typing import BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from space_dist.errors import ConfigError, nearest
+from space_dist.errors import ConfigError, about, nearest
 from space_dist.mazes import CELLS, SIDE, carve, symmetrised
 from space_dist.seeding import Purpose, generator
 
@@ -26,6 +26,8 @@ MAX_LINE_BYTES: Final = 2**20  # some 40,000 features; a file without line ends 
 MAX_INSTANCES: Final = 10_000_000
 MAX_ID: Final = 2**63 - 1
 MAX_REDRAWS: Final = 100
+_BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
+_WIDE: Final = 1e300  # bounds where none are known
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +197,34 @@ def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, 
         raise ConfigError(f"{_shown_path(path)}: cannot be read: {error.strerror}") from error
 
 
+def read_features(path: Path, columns: Sequence[str] = ()) -> tuple[InstanceSet, ContextBounds]:
+    """The instances of a CSV file whose environment is not known, and the least bounds that they lie in.
+
+    All columns but `id` and `columns` are features. Raises ConfigError as `read_csv` does.
+    """
+    names = tuple(name for name in _named_columns(path) if name not in ("id", *columns))
+    if not names:
+        raise ConfigError(f"{_shown_path(path)}: row 1 names no feature")
+    wide = np.full(len(names), _WIDE)
+    with about(_shown_path(path)):
+        instances = read_csv(path, ContextBounds(names, -wide, wide), columns)
+    low, high = instances.contexts.min(axis=0), instances.contexts.max(axis=0)
+    return instances, ContextBounds(names, low, np.where(high > low, high, low + np.maximum(1.0, np.abs(low))))
+
+
+def _named_columns(path: Path) -> list[str]:
+    try:
+        _check_kind_and_size(path)
+        with path.open("rb") as file:
+            row, line = next(_lines(file, first_row=1), (1, b""))
+        cells = _split(row, line.removeprefix(_BYTE_ORDER_MARK))
+        return [cell.decode(errors="replace").strip() for cell in cells]
+    except ConfigError as fault:
+        raise ConfigError(f"{_shown_path(path)}: {fault}") from None
+    except OSError as error:
+        raise ConfigError(f"{_shown_path(path)}: cannot be read: {error.strerror}") from error
+
+
 def refuse_overlap(train: InstanceSet, test: InstanceSet, train_name: str, test_name: str) -> None:
     """Raise ConfigError if a context (compared by content, not by id) is in both sets, with the ids it has in each.
 
@@ -277,7 +307,7 @@ def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], 
     expected = ("id", *bounds.names, *further)
     allowed = f"allowed are {_cut(', '.join(expected), 200)}, each once, separated by commas"
     row, line = next(_lines(file, first_row=1), (1, b""))
-    line = line.removeprefix(b"\xef\xbb\xbf")
+    line = line.removeprefix(_BYTE_ORDER_MARK)
     if b"\0" in line:
         raise ConfigError("row 1 contains a NUL byte: this is not a CSV file in UTF-8")
     try:

@@ -27,7 +27,7 @@ from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.building import make_setup, policy_in, resolved, spec_of
 from space_dist.cluster import Cluster, InProcess
-from space_dist.config import PPOConfig, RunConfig
+from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import (
@@ -72,7 +72,7 @@ def read_instances(config: RunConfig, bounds: ContextBounds) -> tuple[InstanceSe
 
     Raises ConfigError for a bad file, or one that shares a context.
     """
-    columns = config.curriculum.columns
+    columns = config.curriculum.columns_read
     with about("instances.train"):
         train = read_csv(config.instances.train, bounds, columns)
     with about("instances.test"):
@@ -169,7 +169,8 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
-                    "resumed with another arithmetic, other code or library versions: results are valid, but not "
+                    "resumed with another arithmetic, other code (ours, or that of your own environment, policy or "
+                    "curriculum) or library versions: results are valid, but not "
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
@@ -209,7 +210,7 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
 def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
     ledger = writer.ledger
-    now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config))
+    now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config), config.import_paths)
     status = Status(
         state="running", name=config.name, seed=config.seed, steps=0, budget_steps=config.budget.steps, round=0,
         started_at=now, updated_at=now, fingerprint=here,
@@ -244,10 +245,9 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
 
 def _also_decide(config: RunConfig) -> list[str]:
     """The distributions whose arithmetic this run uses, besides those that every run does."""
-    ppo = isinstance(config.learner, PPOConfig)
-    compiled = ppo and (config.engine == "population" or getattr(config.learner, "update", "") == "lean")
+    compiled = config.learner.is_compiled(config.engine)
     also = {
-        "scikit-learn": config.curriculum.kind == "alp_gmm",
+        "scikit-learn": "scikit-learn" in config.curriculum.libraries,
         "pybullet": config.env.id in BULLET_IDS,
         "numba": compiled,
         "llvmlite": compiled,

@@ -107,8 +107,7 @@ def _cell(
             )
         train, test = files.sets(config, spec.context_bounds)
         make_setup(config, spec, train, test)
-        paths = [path for path in (config.env.id, getattr(config.learner, "policy", "")) if ":" in path]
-        sources = {path: source_digest(path) for path in paths}
+        sources = {path: source_digest(path) for path in config.import_paths}
     identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
     data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
     data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in

@@ -24,7 +24,7 @@ from space_dist.envs import BatchedEnv, close
 from space_dist.errors import SpaceDistError, exits_refused
 from space_dist.interrupts import StopRequests
 from space_dist.launch import Outcome, begun, speaking
-from space_dist.learner import CoupledLearner, PopulationLearner, learn_together
+from space_dist.learner import PopulationLearner, learn_together
 from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Stage, Trial, collect, evaluate
 from space_dist.training import Learn, Wait, Work
 from space_dist.walk import Walk
@@ -96,12 +96,10 @@ def _learned(asked: Mapping[Path, Wait | Learn]) -> dict[Path, Any]:
     answers: dict[Path, Any] = {}
     for folder, request in asked.items():
         if isinstance(request, Learn):
-            answers[folder] = made[folder][0]
-            if isinstance(request.learner, CoupledLearner):
-                try:
-                    answers[folder] = request.learner.joined(made[folder])
-                except SpaceDistError as error:
-                    answers[folder] = error
+            try:
+                answers[folder] = request.learner.combined(made[folder])
+            except SpaceDistError as error:
+                answers[folder] = error
     return answers
 
 
@@ -117,13 +115,10 @@ class _Part:
 
 def _parts_of(folder: Path, request: Learn) -> Iterator[_Part]:
     learner = request.learner
-    if isinstance(learner, CoupledLearner):
-        for one, shards in zip(learner.members, learner.parts(request.shards), strict=True):
-            yield _Part(folder, request, one, shards)
-    elif isinstance(learner, PopulationLearner):
-        yield _Part(folder, request, learner, request.shards)
-    else:
+    if not learner.members:
         raise TypeError(f"{folder}: a member of a population needs engine: population")
+    for one, shards in zip(learner.members, learner.parts(request.shards), strict=True):
+        yield _Part(folder, request, one, shards)
 
 
 Seat = tuple[str, int]  # a member's folder and a shard

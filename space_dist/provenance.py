@@ -17,13 +17,22 @@ _MAX_SOURCES = 5_000  # files of a user's package
 _DIGITS = 16
 
 
-def fingerprint(arithmetic: str, also: Iterable[str] = ()) -> dict[str, str]:
+def fingerprint(arithmetic: str, also: Iterable[str] = (), import_paths: Iterable[str] = ()) -> dict[str, str]:
     """What bit-equality is promised for: what the arithmetic computes, this code, and versions of what else decides.
 
     arithmetic: `arithmetic.digest` of everything.  also: distributions that this run uses besides those of every run.
+    import_paths: of somebody's own code that it uses, whose source counts by module.
     """
     versions = {name: _version(name) for name in (*_BITS_DEPEND_ON, *also)}
-    return {"arithmetic": arithmetic, "code": code_digest(), **versions}
+    sources = {f"source.{path.partition(':')[0]}": _source(path) for path in import_paths}
+    return {"arithmetic": arithmetic, "code": code_digest(), **sources, **versions}
+
+
+def _source(import_path: str) -> str:
+    try:
+        return source_digest(import_path)
+    except ConfigError:  # it was imported all the same: a notebook's, or what is too large to read
+        return "unknown"
 
 
 @functools.cache
@@ -65,7 +74,7 @@ def source_digest(import_path: str) -> str:
 def _digest(folder: Path) -> str:
     files = sorted(folder.rglob("*.py"))
     if len(files) > _MAX_SOURCES:
-        raise ConfigError(f"{folder} holds {len(files)} Python files; an environment's package may have {_MAX_SOURCES}")
+        raise ConfigError(f"{folder} holds {len(files)} Python files; a package of your own may have {_MAX_SOURCES}")
     digest = hashlib.sha256()
     for file in files:
         digest.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())

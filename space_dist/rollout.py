@@ -265,7 +265,7 @@ class Worker:
         if not together or not can_act_side_by_side(members_of(policy)):
             return [self.collect(policy, selection, walk, shard=shard, **asked) for shard in shards]
         if _TOGETHER not in self._stages:
-            self._stages[_TOGETHER] = Stage(setup.make_env(len(shards) * setup.slots))
+            self._stages[_TOGETHER] = Stage(self._make(len(shards) * setup.slots))
         return collect(
             self._stages[_TOGETHER],
             [setup.rollout(policy, selection, walk, shard=shard, **asked) for shard in shards],

@@ -18,7 +18,10 @@ UInt64Array = NDArray[np.uint64]
 
 
 class Purpose(enum.IntEnum):
-    """What a stream of random numbers is for. The numbers are part of every result: never reuse or renumber one."""
+    """What a stream of random numbers is for. The numbers are part of every result: never reuse or renumber one.
+
+    CUSTOM is for curricula that are not ours.
+    """
 
     INITIAL_NETWORK = 1
     UPDATE = 2
@@ -38,6 +41,7 @@ class Purpose(enum.IntEnum):
     ENSEMBLE = 16
     ENSEMBLE_UPDATE = 17
     MEMBERS = 18
+    CUSTOM = 19
 
 
 def seed_sequence(seed: int, purpose: Purpose, *keys: int) -> np.random.SeedSequence:

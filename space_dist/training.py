@@ -34,11 +34,11 @@ from numpy.typing import NDArray
 
 from space_dist.building import ensemble_of, learner_of, load_learner, model_of, total_steps
 from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
-from space_dist.config import GrowingConfig, RunConfig
+from space_dist.config import RunConfig
 from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
 from space_dist.episodes import joined_episodes, mean_sizes, summed, told
 from space_dist.errors import Interrupted
-from space_dist.learner import Arrays, CoupledLearner, Learner, Update
+from space_dist.learner import Arrays, Learner, Update
 from space_dist.ledger import (
     CURRICULUM,
     METRICS,
@@ -106,7 +106,7 @@ class Wait:
 class Learn:
     """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
 
-    learner: Learner | CoupledLearner
+    learner: Learner
     shards: list[Shard]
     round: int
     steps: int
@@ -267,10 +267,10 @@ class Training:
         There are none where they, at their longest, would leave no room for another round.
         """
         run, cluster = self._run, self._cluster
-        if not self._config.curriculum.probes:
+        if not self._curriculum.wants.probes:
             return []
         (state,) = yield from self._settle([self._asked.state])
-        indices = self._curriculum.probes(state, joined_episodes(run.seen))
+        indices = self._curriculum.probes(state, joined_episodes(run.seen) if run.seen else None)
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
         outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))
@@ -281,9 +281,8 @@ class Training:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
         rescored, members, episodes, context_values = [], [], [], []
-        growing = self._config.curriculum
-        from_zero = run.version == 0 and isinstance(growing, GrowingConfig) and growing.v0 == "zero"
-        if isinstance(self.learner, Learner) and self.learner.normalises and not from_zero:
+        from_zero = run.version == 0 and self._config.curriculum.starts_from_zero
+        if self.learner.normalises and not from_zero:
             # Both values at one scale: else a change of scale would look like progress.
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         if self.ensemble is not None:
@@ -547,7 +546,7 @@ class Training:
         if self.ensemble is not None:
             self.ensemble.load(checkpoint.under("ensemble/"))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
-        if run.acted and isinstance(self.learner, Learner):
+        if run.acted:
             asked.ahead = self._collect(cluster.put(self.learner.policy_of(run.acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
 

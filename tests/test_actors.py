@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from space_dist import config as configs
 from space_dist.arithmetic import digest, scipy_probes
 from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.errors import SpaceDistError
@@ -19,7 +20,7 @@ from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import METRICS, Ledger
 from tests.patience import PATIENCE
-from tests.test_distributed import cluster_class, config, reference, results  # noqa: F401
+from tests.test_distributed import ROOT, cluster_class, config, reference, results  # noqa: F401
 from tests.test_learners import config_for, learner_section
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("one_ray")]
@@ -110,8 +111,8 @@ def test_actors_are_compared_by_all_that_they_compute_with(
     config = config_for(tmp_path, learner_section("ppo", **policy), env_id)
     spec = spec_of(config)
     setup = make_setup(config, spec, *read_instances(config, spec.context_bounds))
-    section = type("Section", (), {"kind": kind})()
-    config = config.model_copy(update={"curriculum": section})
+    shipped = configs.load(ROOT / "configs/pointmass_space.yaml", [f"curriculum={{kind: {kind}}}"])
+    config = config.model_copy(update={"curriculum": shipped.curriculum})
     for wanted, is_central in ((rollout, False), (central, True)):
         parts = distributed.computes_with(config, setup, central=is_central)
         assert parts == ("numpy", *wanted)

@@ -576,7 +576,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
         options = [option for option in (get_args(field.annotation) or (field.annotation,))
                    if isinstance(option, type) and issubclass(option, BaseModel)]  # fmt: skip
         if not options:
-            yield f"{prefix}{name}"
+            yield f"{prefix}{field.alias or name}"
         for option in options:
             yield from keys(option, f"{prefix}{name}.")
 
@@ -611,7 +611,9 @@ def kinds(section: str) -> list[str]:
     return [get_args(option.model_fields["kind"].annotation)[0] for option in options]
 
 
-NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"}}  # what a kind cannot do without
+# What a kind cannot do without.
+NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"},
+                          "custom": {"import": "my_package.my_module:Mine"}}  # fmt: skip
 CONFIGS = {path.stem: load(path) for path in SHIPPED}
 CONFIGS |= {f"{section}_{kind}": load(SPACE, [f"{section}={json.dumps({'kind': kind, **NEEDED.get(kind, {})})}"])
             for section in ("learner", "curriculum") for kind in kinds(section)}  # fmt: skip
@@ -625,6 +627,7 @@ OTHER_WORDS = {
     "tracking.experiment": "another",
     "resources.address": "auto",
     "curriculum.column": "effort",
+    "curriculum.import": "my_package.my_module:Other",
 }
 # What decides no result, and so is no part of a run's identity: when it is saved, where it is mirrored, what it runs
 # on, and where its instance files lie (their content enters by digest).
@@ -657,7 +660,9 @@ def annotation(config: RunConfig, key: str) -> Any:
     *parents, last = key.split(".")
     for part in parents:
         section = getattr(section, part)
-    return type(section).model_fields[last].annotation if isinstance(section, BaseModel) else Any  # env.kwargs
+    if not isinstance(section, BaseModel):  # env.kwargs
+        return Any
+    return next(field.annotation for name, field in type(section).model_fields.items() if last in (name, field.alias))
 
 
 def words_in(annotation: Any) -> list[str]:
@@ -673,7 +678,7 @@ def candidates(config: RunConfig, key: str, value: Any) -> list[Any]:
     if isinstance(value, int | float):
         return [value * 2 or 1, value / 2 or 0.5, *words]
     if isinstance(value, list):
-        return [[32, 32]]
+        return [[32, 32], ["effort"]]
     return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1, [0.5, 0.5], ["a"]]
 
 
@@ -789,3 +794,21 @@ def test_tracking_uris_that_could_not_be_mirrored_to_are_refused_and_no_password
     assert "sqlite:////absolute/path/mlflow.db" in text
     assert "secret" not in str(caught.value)
     assert ("MLFLOW_TRACKING_PASSWORD" in text) == ("http" in uri and "secret" in uri and "[" not in uri)
+
+
+def test_learners_say_what_they_can_do() -> None:
+    found = {ability: configs.learners_that(ability) for ability in
+             ("has_advantages", "keeps_next_observations", "can_be_stacked")}  # fmt: skip
+    assert found == {
+        "has_advantages": ["ppo", "trpo", "a2c"],
+        "keeps_next_observations": ["dqn", "sac", "td3"],
+        "can_be_stacked": ["ppo", "trpo"],
+    }
+    actions = {kind: CONFIGS[f"learner_{kind}"].learner.actions for kind in kinds("learner")}
+    assert {kind: what for kind, what in actions.items() if what != "any"} == {
+        "dqn": "discrete", "sac": "bounded", "td3": "bounded",
+    }  # fmt: skip
+    compiled = [(update, engine) for update in ("stock", "lean") for engine in ("single", "population")
+                if load(SPACE, [f"learner.update={update}"]).learner.is_compiled(engine)]  # fmt: skip
+    assert compiled == [("stock", "population"), ("lean", "single"), ("lean", "population")]
+    assert not CONFIGS["learner_trpo"].learner.is_compiled("population")

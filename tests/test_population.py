@@ -254,12 +254,15 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
         assert np.array_equal(shard.actions, again.actions)
     alone = learner_of(config, spec)
     assert isinstance(alone, CoupledLearner)
+    before = learner.scored()
     update = learner.update(shards, round=0, steps=3 * N_STEPS)
     for member, mine in zip(alone.members, alone.parts(shards), strict=True):
         made = member.update(mine, round=0, steps=3 * N_STEPS)
         assert made.gradient_steps == update.gradient_steps
     ours, theirs = learner.scored(), alone.scored()
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+    assert not np.array_equal(worker.start_values(learner.policy(1), 0), np.mean(own, axis=0))
+    assert np.array_equal(worker.start_values(learner.policy_of(before, 1), 0), np.mean(own, axis=0))
 
 
 def test_each_of_them_meets_the_whole_selection_in_every_iteration(

@@ -11,6 +11,7 @@ import typer
 
 from space_dist.arithmetic import overruled
 from space_dist.cli import runs
+from space_dist.cli.curricula import curriculum_app
 from space_dist.cli.grids import grid_app
 from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
@@ -29,6 +30,7 @@ app.add_typer(slurm_app, name="slurm")
 app.add_typer(instances_app, name="instances")
 app.add_typer(config_app, name="config")
 app.add_typer(env_app, name="env")
+app.add_typer(curriculum_app, name="curriculum")
 
 
 def main() -> None:

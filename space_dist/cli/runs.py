@@ -89,7 +89,7 @@ def evaluate(
     config = stored_config(ledger)
     spec = spec_of(config)
     policies = members_of(policy_of(ledger, spec))
-    chosen = read_csv(instances, spec.context_bounds, config.curriculum.columns, if_there=True)
+    chosen = read_csv(instances, spec.context_bounds, config.curriculum.columns_read, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     optimum = None
     with exits_refused(), spec.opened(len(chosen)) as env:
@@ -141,7 +141,7 @@ def explain(
     config = stored_config(ledger)
     ledger.read(ledger.instances("train"))
     bounds = spec_of(config).context_bounds
-    train = read_csv(ledger.instances("train"), bounds, config.curriculum.columns)
+    train = read_csv(ledger.instances("train"), bounds, config.curriculum.columns_read)
     for line in explain_decision(ledger, config, bounds, train, iteration):
         print(line)
     delivered()

@@ -114,7 +114,9 @@ Overrides = Annotated[
 
 Kwargs = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
-    typer.Option("--kwarg", metavar="NAME=VALUE", help="An argument of the environment (env.kwargs). Repeatable."),
+    typer.Option(
+        "--kwarg", metavar="NAME=VALUE", help="An argument of what is imported (kwargs in a config). Repeatable."
+    ),
 ]
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -11,6 +11,7 @@ from space_dist.config import (
     AlpGmmConfig,
     ContextSpaceConfig,
     CurriculumConfig,
+    CustomConfig,
     FixedConfig,
     LearnabilityConfig,
     LevelReplayConfig,
@@ -24,6 +25,7 @@ from space_dist.config import (
 )
 from space_dist.curricula import variants
 from space_dist.curricula.alp_gmm import AlpGmm
+from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
 from space_dist.curricula.gaussian import Gaussian
 from space_dist.curricula.interface import Curriculum, FloatArray
@@ -63,6 +65,7 @@ class Makers:
             AlpGmmConfig: self._alp_gmm,
             LevelReplayConfig: self._level_replay,
             LearnabilityConfig: self._learnability,
+            CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
 
@@ -204,3 +207,11 @@ class Makers:
                 f"[{bounds.low[at]:g}, {bounds.high[at]:g}]"
             )
         return values
+
+    # ---- anybody's ----
+
+    def _custom(self, settings: CustomConfig) -> Custom:
+        return make_custom(
+            settings.import_path, settings.kwargs,
+            instances=self._train, seed=self._seed, draws=self._draws, bounds=self._bounds,
+        )  # fmt: skip

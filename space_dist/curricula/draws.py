@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,7 @@ class DrawnState(State):
 class Drawn(Curriculum):
     """Every episode's instance is drawn anew, by `DrawnState.chances`, which are settled once an iteration."""
 
-    state_type: ClassVar[type[State]] = DrawnState
+    state_type: type[State] = DrawnState
     wants = Wants(episodes=True)
 
     def __init__(self, instances: InstanceSet, *, seed: int, draws: Draws) -> None:

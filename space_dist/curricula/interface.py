@@ -6,7 +6,7 @@ import abc
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,11 +107,13 @@ class Wants:
     episodes: `Feedback.episodes`.
     advantages: `Episodes.advantages`, which only learners with advantages have.
     ensemble: an ensemble of value functions, trained on the rollouts, and its `Feedback.members`.
+    probes: to be asked, by `Curriculum.probes`, which instances shall be probed; the environment must report success.
     """
 
     episodes: bool = False
     advantages: bool = False
     ensemble: bool = False
+    probes: bool = False
 
 
 @dataclass(frozen=True)
@@ -174,10 +176,13 @@ def selection_of(instances: InstanceSet, state: SetState) -> Selection:
 
 
 class Curriculum(abc.ABC):
-    """Chooses what to train on next. Implementations hold the instance set and constants only, never a state."""
+    """Chooses what to train on next. Implementations hold the instance set and constants only, never a state.
 
-    state_type: ClassVar[type[State]]
-    wants: ClassVar[Wants] = Wants()
+    state_type: what it remembers from one decision to the next.  wants: what it is told and asked.
+    """
+
+    state_type: type[State]
+    wants: Wants = Wants()
 
     @abc.abstractmethod
     def start(self) -> tuple[State, Selection]:
@@ -197,6 +202,7 @@ class Curriculum(abc.ABC):
     def probes(self, state: Any, episodes: Episodes | None) -> IntArray | None:  # noqa: ARG002 - most ask for none
         """`(k,)` indices of instances, one for each episode that the feedback on `state`'s selection shall probe.
 
-        episodes: the iteration's, if `Wants.episodes`; their start values need not be known yet. Pure.
+        Asked if `Wants.probes`.  episodes: the iteration's, if `Wants.episodes`; their start values need not be known
+        yet. Pure.
         """
         return None

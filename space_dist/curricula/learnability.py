@@ -7,7 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from space_dist.curricula.draws import Drawn, DrawnState, Draws, uniform
-from space_dist.curricula.interface import BoolArray, Episodes, Feedback, FloatArray, IntArray, Numbers, Selection
+from space_dist.curricula.interface import (
+    BoolArray,
+    Episodes,
+    Feedback,
+    FloatArray,
+    IntArray,
+    Numbers,
+    Selection,
+    Wants,
+)
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, UInt64Array, generator, instance_keys
 
@@ -39,6 +48,7 @@ class Learnability(Drawn):
     """
 
     state_type = ProbedState
+    wants = Wants(episodes=True, probes=True)
 
     def __init__(
         self, instances: InstanceSet, *, seed: int, draws: Draws, top: int, uniform_share: float,

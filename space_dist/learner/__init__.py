@@ -30,7 +30,7 @@ from space_dist.kernels import COMPILES
 from space_dist.learner.coupled import CoupledLearner
 from space_dist.learner.elementary import torch_probes  # and replaces kernels of torch
 from space_dist.learner.ensemble import Ensemble
-from space_dist.learner.interface import Arrays, Learner, Update, refuse_spaces
+from space_dist.learner.interface import Arrays, Learner, SB3Learner, Update, refuse_spaces
 from space_dist.learner.networks import is_mlp
 from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
 from space_dist.learner.on_policy import OnPolicyLearner
@@ -52,7 +52,7 @@ def make_learner(
     total_steps: int,
     population: bool = False,
     device: str = "cpu",
-) -> Learner:
+) -> SB3Learner:
     """A config's learner with its initial networks, seeded.
 
     n_slots, slot_length: of a round, over all shards; total_steps: of the run, for schedules. population: one whose
@@ -78,9 +78,8 @@ def refuse_machine(config: RunConfig) -> None:
     """Raise ConfigError where a config's updates cannot be computed here."""
     if config.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device: cuda: torch finds no GPU on this machine; use device: cpu")
-    population = config.engine == "population" and config.device == "cpu"
-    if not COMPILES and isinstance(config.learner, PPOConfig) and (population or config.learner.update == "lean"):
-        what = "engine: population" if population else "learner.update: lean"
+    if not COMPILES and config.device == "cpu" and config.learner.is_compiled(config.engine):
+        what = "engine: population" if config.engine == "population" else "learner.update: lean"
         raise ConfigError(
             "NUMBA_DISABLE_JIT is set (in the environment, or in .numba_config.yaml), which keeps Numba from "
             f"compiling, and the update of {what} is a compiled function: unset it, or use learner.update: stock with "
@@ -110,6 +109,7 @@ __all__ = [
     "OffPolicyLearner",
     "OnPolicyLearner",
     "PopulationLearner",
+    "SB3Learner",
     "Update",
     "is_mlp",
     "learn_together",

@@ -17,9 +17,9 @@ from space_dist.rollout import Shard
 
 
 class CoupledLearner:
-    """`len(members)` PPO learners with seeds of their own; each learns from its own equal part of a round's shards.
+    """`len(members)` learners with seeds of their own; each learns from its own equal part of a round's shards.
 
-    To the curriculum they are one: an instance's value is the mean of theirs (`policy.Several`).
+    A `Learner`: to the curriculum they are one, and an instance's value is the mean of theirs (`policy.Several`).
     """
 
     normalises = False
@@ -29,25 +29,35 @@ class CoupledLearner:
     def __init__(self, members: Sequence[PopulationLearner]) -> None:
         self.members = tuple(members)
 
+    @property
+    def policy_name(self) -> str:
+        """See `Learner`."""
+        return self.members[0].policy_name
+
     def policy(self, version: int) -> Several:
-        """As `Learner.policy`."""
+        """See `Learner`."""
         return Several(version, tuple(member.policy(version) for member in self.members))
 
     def scored(self) -> Arrays:
-        """As `Learner.scored`, of all members."""
+        """See `Learner`: of all members."""
         return {f"{number}/{name}": array for number, member in enumerate(self.members)
                 for name, array in member.scored().items()}  # fmt: skip
 
+    def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Several:
+        """See `Learner`."""
+        each = (member.policy_of(_under(number, scored), version) for number, member in enumerate(self.members))
+        return Several(version, tuple(each))
+
     def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
-        """Each member's own shards, counted from 0."""
+        """See `Learner`."""
         each = len(shards) // len(self.members)
         return [
             [dataclasses.replace(shard, shard=number) for number, shard in enumerate(shards[first : first + each])]
             for first in range(0, len(shards), each)
         ]
 
-    def joined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
-        """The members' updates as one: means of what they report. Raises what one of them failed with."""
+    def combined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
+        """See `Learner`: means of what the members report."""
         done = []
         for update in updates:
             if isinstance(update, SpaceDistError):
@@ -60,36 +70,38 @@ class CoupledLearner:
     def update(
         self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
     ) -> Update:  # fmt: skip
-        """As `Learner.update`; `steps` are those of all members together."""
+        """See `Learner`; `steps` are those of all members together."""
         if acted is not None:
             raise RuntimeError("a population learns from rounds of its present weights only")
         count = len(self.members)
-        return self.joined(
+        return self.combined(
             learn_together(self.members, self.parts(shards), round=[round] * count, steps=[steps] * count)
         )
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
-        """As `Learner.save`."""
+        """See `Learner`."""
         saved = [member.save() for member in self.members]
         arrays = {f"{number}/{name}": array for number, (mine, _) in enumerate(saved) for name, array in mine.items()}
         return arrays, {str(number): data for number, (_, data) in enumerate(saved)}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
-        """As `Learner.load`."""
+        """See `Learner`."""
         for number, member in enumerate(self.members):
-            prefix = f"{number}/"
-            member.load(
-                {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)},
-                data[str(number)],
-            )
+            member.load(_under(number, arrays), data[str(number)])
 
     def transitions(self, first: int) -> Arrays:  # noqa: ARG002 - there is no replay buffer
-        """As `Learner.transitions`."""
+        """See `Learner`."""
         return {}
 
     def observe(self, shards: Sequence[Shard]) -> None:
-        """As `Learner.observe`: nothing is normalised."""
+        """See `Learner`: nothing is normalised."""
 
     def remember(self, arrays: Mapping[str, NDArray[Any]], first: int) -> None:  # noqa: ARG002 - as above
-        """As `Learner.remember`."""
+        """See `Learner`."""
         raise RuntimeError("this learner keeps no replay buffer")
+
+
+def _under(number: int, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """One member's, of arrays that are named by members."""
+    prefix = f"{number}/"
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

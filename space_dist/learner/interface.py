@@ -6,7 +6,7 @@ import abc
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -19,9 +19,12 @@ from space_dist.config import LearnerConfig
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
 from space_dist.learner.normaliser import Normaliser
-from space_dist.policy import Policy, Statistics
+from space_dist.policy import Policy, Several, Statistics
 from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_generators, global_seeds
+
+if TYPE_CHECKING:  # it derives from what is here
+    from space_dist.learner.population import PopulationLearner
 
 Arrays = dict[str, NDArray[Any]]
 NOT_A_NUMBER = "a weight is not a number"
@@ -40,8 +43,78 @@ class Update:
     advantages: NDArray[np.float64] | None = None
 
 
-class Learner(abc.ABC):
-    """One of Stable-Baselines3's algorithms, on transitions that somebody else collected.
+class Learner(Protocol):
+    """What a run needs of whatever it trains.
+
+    Stable-Baselines3's algorithms are `SB3Learner`s; several that share a curriculum are a `CoupledLearner`.
+    """
+
+    @property
+    def members(self) -> Sequence[PopulationLearner]:
+        """Those whose updates, made together with others', make this one's; none where it is made alone."""
+
+    @property
+    def normalises(self) -> bool:
+        """Whether observations or rewards are normalised: start values must then be compared at one scale."""
+
+    @property
+    def statistics(self) -> Statistics:
+        """The scales in force: what actors act with until the next update."""
+
+    @property
+    def policy_name(self) -> str:
+        """The class of the policy, in words."""
+
+    def policy(self, version: int) -> Policy | Several:
+        """A copy of the policy and its value function, for actors."""
+
+    def scored(self) -> Arrays:
+        """The weights of the networks as they are, for `policy_of` to score later under later scales."""
+
+    def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Policy | Several:
+        """The policy of earlier weights, under the scales in force now."""
+
+    def observe(self, shards: Sequence[Shard]) -> None:
+        """Take a round's transitions into the statistics, in shard order, without learning from them."""
+
+    def update(
+        self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
+        """One update on one round's shards, in shard order. `steps`: environment steps including this round's.
+
+        acted: the weights that the shards were collected with, if those are not the present ones (`scored` gave them).
+        Raises SpaceDistError if the networks are no longer numbers.
+        """
+
+    def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
+        """The shards of each of `members`, counted from 0."""
+
+    def combined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
+        """The updates of `members` as one. Raises what one of them failed with."""
+
+    def save(self) -> tuple[Arrays, dict[str, Any]]:
+        """Arrays and plain data from which `load` restores the learner bit for bit; replay buffers apart."""
+
+    def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
+        """Restore what `save` gave."""
+
+    @property
+    def seen(self) -> int:
+        """How many transitions have entered the replay buffer so far."""
+
+    @property
+    def capacity(self) -> int:
+        """How many the replay buffer remembers; 0 where there is none."""
+
+    def transitions(self, first: int) -> Arrays:
+        """What entered the replay buffer since it had seen `first` transitions; nothing where there is no buffer."""
+
+    def remember(self, arrays: Mapping[str, NDArray[Any]], first: int) -> None:
+        """Put back what `transitions(first)` gave. Raises RuntimeError where there is no buffer."""
+
+
+class SB3Learner(abc.ABC):
+    """One of Stable-Baselines3's algorithms, on transitions that somebody else collected: a `Learner`.
 
     model: SB3's algorithm object; it has no environment.
     """
@@ -88,26 +161,26 @@ class Learner(abc.ABC):
 
     @property
     def normalises(self) -> bool:
-        """Whether observations or rewards are normalised: start values must then be compared at one scale."""
+        """See `Learner`."""
         return self._normaliser is not None
 
     @property
     def statistics(self) -> Statistics:
-        """The scales in force: what actors act with until the next update."""
+        """See `Learner`."""
         return self._normaliser.statistics if self._normaliser else Statistics()
 
     def policy(self, version: int) -> Policy:
-        """A copy of the policy and its value function, for actors."""
+        """See `Learner`."""
         if is_mlp(self._config, self.model.observation_space):
             return self._mlp(version, self.statistics)
         return torch_policy(self._config, self.model, version, self.statistics, self._head())
 
     def scored(self) -> Arrays:
-        """The weights of the networks as they are, for `policy_of` to score later under later scales."""
+        """See `Learner`."""
         return {name: _copy(tensor) for name, tensor in self.model.policy.state_dict().items()}
 
     def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Policy:
-        """The policy of earlier weights, under the scales in force now."""
+        """See `Learner`."""
         with self._weights(scored):
             return self.policy(version)
 
@@ -124,23 +197,40 @@ class Learner(abc.ABC):
         finally:
             self.model.policy.load_state_dict({name: torch.as_tensor(array) for name, array in now.items()})
 
+    @property
+    def members(self) -> Sequence[PopulationLearner]:
+        """See `Learner`."""
+        return ()
+
+    @property
+    def policy_name(self) -> str:
+        """See `Learner`."""
+        return str(type(self.model.policy))
+
+    def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
+        """See `Learner`."""
+        return [list(shards) for _ in self.members]
+
+    def combined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
+        """See `Learner`."""
+        (update,) = updates
+        if isinstance(update, SpaceDistError):
+            raise update
+        return update
+
     @abc.abstractmethod
     def _head(self) -> Any:
         """How outputs become actions."""
 
     def observe(self, shards: Sequence[Shard]) -> None:
-        """Take a round's transitions into the statistics, in shard order, without learning from them."""
+        """See `Learner`."""
         if self._normaliser is not None:
             self._normaliser.update(shards)
 
     def update(
         self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
     ) -> Update:  # fmt: skip
-        """One update on one round's shards, in shard order. `steps`: environment steps including this round's.
-
-        acted: the weights that the shards were collected with, if those are not the present ones (`scored` gave them).
-        Raises SpaceDistError if the networks are no longer numbers.
-        """
+        """See `Learner`."""
         require_order(shards)
         self._acted = acted
         before = self._gradient_steps()
@@ -175,7 +265,7 @@ class Learner(abc.ABC):
         return max((int(state["step"]) for state in first.state.values()), default=0)
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
-        """Arrays and plain data from which `load` restores the learner bit for bit; replay buffers apart."""
+        """See `Learner`."""
         arrays: Arrays = {f"policy/{name}": _copy(tensor) for name, tensor in self.model.policy.state_dict().items()}
         numbers: dict[str, float] = {}
         for kind, optimizer in self._optimizers().items():
@@ -190,7 +280,7 @@ class Learner(abc.ABC):
         return arrays, {"n_updates": self.model._n_updates, "optimizer_numbers": numbers}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
-        """Restore what `save` gave."""
+        """See `Learner`."""
         self.model.policy.load_state_dict(
             {name.removeprefix("policy/"): torch.as_tensor(array.copy())
              for name, array in arrays.items() if name.startswith("policy/")}
@@ -214,21 +304,21 @@ class Learner(abc.ABC):
         self.model._n_updates = int(data["n_updates"])
 
     def transitions(self, first: int) -> Arrays:  # noqa: ARG002 - the signature of those that have a buffer
-        """What entered the replay buffer since it had seen `first` transitions; nothing where there is no buffer."""
+        """See `Learner`."""
         return {}
 
     @property
     def seen(self) -> int:
-        """How many transitions have entered the replay buffer so far."""
+        """See `Learner`."""
         return 0
 
     @property
     def capacity(self) -> int:
-        """How many the replay buffer remembers."""
+        """See `Learner`."""
         return 0
 
     def remember(self, arrays: Mapping[str, NDArray[Any]], first: int) -> None:  # noqa: ARG002 - as above
-        """Put back what `transitions(first)` gave. Raises RuntimeError where there is no buffer."""
+        """See `Learner`."""
         raise RuntimeError("this learner keeps no replay buffer")
 
 
@@ -257,10 +347,10 @@ def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], a
         raise ConfigError("learner.normalize_observations: only flat observations can be normalised")
     continuous = isinstance(action_space, spaces.Box) and len(action_space.shape) == 1
     discrete = isinstance(action_space, spaces.Discrete) and action_space.start == 0
-    if kind == "dqn" and not discrete:
-        raise ConfigError(f"learner.kind: dqn needs discrete actions (Discrete from 0), not {action_space}")
+    if config.actions == "discrete" and not discrete:
+        raise ConfigError(f"learner.kind: {kind} needs discrete actions (Discrete from 0), not {action_space}")
     bounded = isinstance(action_space, spaces.Box) and action_space.is_bounded()
-    if kind in ("sac", "td3") and not (continuous and bounded):
+    if config.actions == "bounded" and not (continuous and bounded):
         raise ConfigError(f"learner.kind: {kind} needs bounded continuous actions (a flat Box), not {action_space}")
     if not continuous and not discrete:
         raise ConfigError(f"env.id: actions must be a one-dimensional Box or Discrete from 0, not {action_space}")

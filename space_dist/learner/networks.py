@@ -15,11 +15,8 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.dqn.policies import DQNPolicy
-from stable_baselines3.sac.policies import SACPolicy
-from stable_baselines3.td3.policies import TD3Policy
 
-from space_dist.config import DQNConfig, LearnerConfig
+from space_dist.config import A2CConfig, DQNConfig, LearnerConfig
 from space_dist.envs import Observations
 from space_dist.errors import ConfigError
 from space_dist.importing import load
@@ -29,11 +26,6 @@ ALGORITHMS: dict[str, Any] = {
     "ppo": PPO, "trpo": TRPO, "a2c": A2C, "dqn": DQN, "sac": SAC, "td3": TD3,
 }  # fmt: skip
 
-
-_BASES: dict[str, type[BasePolicy]] = {
-    "ppo": ActorCriticPolicy, "trpo": ActorCriticPolicy, "a2c": ActorCriticPolicy,
-    "dqn": DQNPolicy, "sac": SACPolicy, "td3": TD3Policy,
-}  # fmt: skip
 _LEAST_IMAGE = 36  # pixels: what the convolutions of SB3's NatureCNN leave something of
 
 
@@ -45,13 +37,12 @@ def is_mlp(config: LearnerConfig, observation_space: spaces.Space[Any]) -> bool:
 def policy_kwargs(config: LearnerConfig) -> dict[str, Any]:
     """What SB3's policies are made with."""
     kwargs: dict[str, Any] = {
+        **config.policy_settings(),
         "net_arch": list(config.net_arch),
         "activation_fn": torch.nn.Tanh if config.activation == "tanh" else torch.nn.ReLU,
     }
-    if config.kind in ("ppo", "trpo", "a2c"):
-        kwargs["log_std_init"] = config.log_std_init
-    if config.kind == "a2c":
-        kwargs |= {"optimizer_class": torch.optim.Adam} if not config.use_rms_prop else {}
+    if isinstance(config, A2CConfig) and not config.use_rms_prop:
+        kwargs["optimizer_class"] = torch.optim.Adam
     return kwargs
 
 
@@ -68,10 +59,10 @@ def policy_class(config: LearnerConfig) -> str | type[BasePolicy]:
 
 def refuse_policy(config: LearnerConfig, observation_space: spaces.Space[Any]) -> None:
     """Raise ConfigError if SB3 cannot build this policy for these observations."""
-    found, bases = policy_class(config), _BASES[config.kind]
+    found, base = policy_class(config), ALGORITHMS[config.kind].policy_aliases["MlpPolicy"]
     if not isinstance(found, str):
-        if not issubclass(found, bases):
-            raise ConfigError(f"learner.policy {config.policy!r} is no policy of {config.kind}: no {bases.__name__}")
+        if not issubclass(found, base):
+            raise ConfigError(f"learner.policy {config.policy!r} is no policy of {config.kind}: no {base.__name__}")
         return
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
     flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
@@ -137,12 +128,12 @@ class TorchPolicy:
         network: Any = _network(self)
         with torch.no_grad():
             inputs = tensors(self.statistics.scaled(observations))
-            if self.config.kind == "dqn":
+            if self.head.kind == "greedy":
                 outputs = network.q_net(inputs)
-            elif self.config.kind == "sac":
+            elif self.head.kind == "squashed":
                 mean, log_std, _ = network.actor.get_action_dist_params(inputs)
                 outputs = torch.cat([mean, log_std], dim=1)
-            elif self.config.kind == "td3":
+            elif self.head.kind == "deterministic":
                 actor = network.actor
                 outputs = actor.mu[:-1](actor.extract_features(inputs, actor.features_extractor))
             else:
@@ -158,7 +149,7 @@ class TorchPolicy:
             inputs = tensors(self.statistics.scaled(observations))
             if isinstance(network, ActorCriticPolicy):
                 values = network.predict_values(inputs)[:, 0]
-            elif self.config.kind == "dqn":
+            elif self.head.kind == "greedy":
                 target = isinstance(self.config, DQNConfig) and self.config.scored_network == "target"
                 values = (network.q_net_target if target else network.q_net)(inputs).max(dim=1).values
             else:

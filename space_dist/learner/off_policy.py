@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from space_dist.config import DQNConfig, SACConfig, TD3Config
 from space_dist.envs import Observations
 from space_dist.envs.observations import each, put, take
-from space_dist.learner.interface import Arrays, Learner, schedule
+from space_dist.learner.interface import Arrays, SB3Learner, schedule
 from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs
 from space_dist.policy import Exploration, Head, MlpPolicy, Statistics
 from space_dist.rollout import Shard
@@ -28,7 +28,7 @@ _OURS = {
 }  # fmt: skip
 
 
-class OffPolicyLearner(Learner):
+class OffPolicyLearner(SB3Learner):
     """What DQN, SAC and TD3 share: the replay buffer, and the ratio of gradient steps to environment steps."""
 
     model: OffPolicyAlgorithm
@@ -122,7 +122,7 @@ class OffPolicyLearner(Learner):
         return arrays
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
-        """As `Learner.save`."""
+        """See `Learner`."""
         arrays, data = super().save()
         return arrays, {**data, "seen": self._seen}
 
@@ -161,12 +161,12 @@ class DQNLearner(OffPolicyLearner):
         )  # fmt: skip
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
-        """As `Learner.save`."""
+        """See `Learner`."""
         arrays, data = super().save()
         return arrays, {**data, "n_calls": self.model._n_calls}  # type: ignore[attr-defined]
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
-        """As `Learner.load`."""
+        """See `Learner`."""
         super().load(arrays, data)
         self.model._n_calls = int(data["n_calls"])  # type: ignore[attr-defined]
 
@@ -204,14 +204,14 @@ class SACLearner(_ContinuousLearner):
         return {**super()._more_metrics(metrics), **log_alpha}
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
-        """As `Learner.save`."""
+        """See `Learner`."""
         arrays, data = super().save()
         if self.model.log_ent_coef is not None:
             arrays["log_ent_coef"] = self.model.log_ent_coef.detach().numpy().copy()
         return arrays, data
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
-        """As `Learner.load`."""
+        """See `Learner`."""
         super().load(arrays, data)
         if self.model.log_ent_coef is not None:
             with torch.no_grad():

@@ -16,7 +16,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from space_dist.config import A2CConfig, PPOConfig, TRPOConfig
 from space_dist.envs import Observations
 from space_dist.envs.observations import concatenate, each, put, rows
-from space_dist.learner.interface import Learner, schedule
+from space_dist.learner.interface import SB3Learner, schedule
 from space_dist.learner.lean import LeanPPO
 from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs, tensors
 from space_dist.policy import Head, MlpPolicy, Statistics
@@ -45,7 +45,7 @@ class Joined:
     starts: NDArray[np.bool_]
 
 
-class OnPolicyLearner(Learner):
+class OnPolicyLearner(SB3Learner):
     """A learner whose advantages, returns and losses are SB3's own, on our shards; or `lean`'s."""
 
     model: OnPolicyAlgorithm

@@ -19,7 +19,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.utils import explained_variance
 
-from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig
+from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig, learners_that
 from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.kernels import Shape
@@ -96,6 +96,11 @@ class PopulationLearner(OnPolicyLearner):
         self.key = (stack_key(config, observation_space, action_space), dtype, device, self.stacked)
 
     @property
+    def members(self) -> Sequence[PopulationLearner]:
+        """See `Learner`."""
+        return (self,)
+
+    @property
     def _compiled(self) -> bool:
         return not self.stacked
 
@@ -150,8 +155,9 @@ class PopulationLearner(OnPolicyLearner):
 
 def refuse(config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Raise ConfigError where the population engine cannot learn."""
-    if not isinstance(config, PPOConfig | TRPOConfig):
-        raise ConfigError(f"engine: population learns with learner.kind: ppo or trpo, not {config.kind}")
+    if not config.can_be_stacked:
+        able = " or ".join(learners_that("can_be_stacked"))
+        raise ConfigError(f"engine: population learns with learner.kind: {able}, not {config.kind}")
     if config.policy != "MlpPolicy":
         raise ConfigError(f"engine: population learns with learner.policy: MlpPolicy, not {config.policy}")
     if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
@@ -175,9 +181,11 @@ def stack_key(config: LearnerConfig, observation_space: spaces.Space[Any], actio
 
 
 def member_bytes(
-    config: PPOConfig | TRPOConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], device: str
+    config: LearnerConfig, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], device: str
 ) -> int:
     """About what a member takes of its process's memory while it learns, no less: rollouts, activations, networks."""
+    if not isinstance(config, PPOConfig | TRPOConfig):
+        raise TypeError(config)
     shape = _shape(config, observation_space, action_space)
     parameters = 2 * Layout(shape).length
     if isinstance(config, PPOConfig) and device == "cpu":  # one learns at a time, and the others hold what they are

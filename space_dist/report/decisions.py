@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from space_dist.cluster import make_curriculum
-from space_dist.config import FixedConfig, GrowingConfig, RoundRobinConfig, RunConfig
+from space_dist.config import CustomConfig, FixedConfig, GrowingConfig, RoundRobinConfig, RunConfig
 from space_dist.curricula import Feedback, SetState
 from space_dist.curricula.variants import readings
 from space_dist.errors import ConfigError, LedgerError
@@ -31,8 +31,9 @@ def explain(
     """
     settings = config.curriculum
     if not isinstance(settings, GrowingConfig | RoundRobinConfig | FixedConfig):
+        what = "chooses by rules of its own" if isinstance(settings, CustomConfig) else "draws its instances"
         raise ConfigError(
-            f"{ledger.folder}: curriculum.kind: {settings.kind} draws its instances, so it has no lines 6 to 12; "
+            f"{ledger.folder}: curriculum.kind: {settings.kind} {what}, so it has no lines 6 to 12; "
             "explained are space, random_growth, cspace, manual, round_robin and fixed"
         )
     decided = [row for row in ledger.rows(METRICS) if row["kind"] == "iteration" and row["complete"]]
