@@ -130,6 +130,7 @@ class RolloutActor(_Timed, Worker):
         look_in(folders)
         threadpool_limits(limits=1)
         super().__init__(setup)
+        self.make_first()
 
 
 class CurriculumActor(_Timed, Central):

@@ -248,11 +248,15 @@ class Worker:
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._open: list[BatchedEnv] = []
-        self._first = [self._make(setup.slots)]  # whatever is wrong with it shall be known before any work is asked
+        self._first: list[BatchedEnv] = []
         self._stages: dict[int, Stage] = {}  # by shard; what is beyond LIVE shares one
         self._evaluating: dict[int, BatchedEnv] = {}
         self._scoring: BatchedEnv | None = None
         self._starts: dict[int, tuple[Observations, IntArray | None]] = {}
+
+    def make_first(self) -> None:
+        """Make the first environment: what is wrong with it is then known before any work is asked."""
+        self._first.append(self._make(self._setup.slots))
 
     def collect_all(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> list[Shard]:
         """All shards of one round; `asked`: see `Setup.rollout`.

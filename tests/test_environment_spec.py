@@ -224,22 +224,24 @@ def test_physics_clients_are_disconnected_behind_the_visible_context() -> None:
 
 # ---- whole runs ----
 
-# How many slots, and how often, beside those of every run: one to look at; 5 for each shard; 4 for the starts of all
-# instances; 12 and 6 for a part of an evaluation.
+# How many slots, and how often, beside those of every run: one to look at; 4 for the starts of all instances; 12 and 6
+# for a part of an evaluation. All shards of 5 slots are collected together.
 RUNS: dict[str, tuple[dict[str, Any], dict[int, int]]] = {
-    "round_robin": ({"curriculum": {"kind": "round_robin"}}, {}),
-    "space": ({"curriculum": {"kind": "space"}}, {4: 1}),  # are starts alike?
-    "vds": ({"curriculum": {"kind": "vds"}}, {4: 1}),
-    "spdrl": ({"curriculum": {"kind": "spdrl"}}, {4: 1, 5: 1}),  # contexts that are no instances' are scored
+    "round_robin": ({"curriculum": {"kind": "round_robin"}}, {10: 1}),
+    "space": ({"curriculum": {"kind": "space"}}, {10: 1, 4: 1}),  # are starts alike?
+    "vds": ({"curriculum": {"kind": "vds"}}, {10: 1, 4: 1}),
+    "spdrl": ({"curriculum": {"kind": "spdrl"}}, {10: 1, 4: 1, 5: 1}),  # contexts that are no instances' are scored
     "learnability": (  # is success known? And three candidates are probed, by turns
         {"curriculum": {"kind": "learnability", "top": 2, "every": 1, "candidates": 3, "episodes": 2},
-         "budget": {"steps": 400}}, {1: 1, 3: 1},
+         "budget": {"steps": 400}}, {10: 1, 1: 1, 3: 1},
     ),
     "several": (
         {"curriculum": {"kind": "space", "aggregate": "population", "policies": 2}, "engine": "population",
-         "budget": {"steps": 480}}, {4: 1, 5: 2},
+         "budget": {"steps": 480}}, {20: 1, 4: 1},
     ),
-    "overlap": ({"curriculum": {"kind": "round_robin"}, "rollout": {"shards": 2, "slots": 5, "overlap": True}}, {}),
+    "overlap": (
+        {"curriculum": {"kind": "round_robin"}, "rollout": {"shards": 2, "slots": 5, "overlap": True}}, {10: 1},
+    ),
 }  # fmt: skip
 
 
@@ -257,7 +259,7 @@ def test_a_run_looks_at_its_environment_once_and_closes_all_that_it_makes(name: 
     sections, more = RUNS[name]
     launch(counted(tmp_path, **sections), tmp_path / "run", resume=False, stop=StopRequests())
     assert not Counted.opened
-    assert Counter(Counted.made) == Counter({1: 1, 5: 2, 4: 1, 12: 1, 6: 1}) + Counter(more)
+    assert Counter(Counted.made) == Counter({1: 1, 4: 1, 12: 1, 6: 1}) + Counter(more)
 
 
 def test_a_resumed_run_and_a_failed_one_close_theirs(tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ import pytest
 
 from space_dist import cli
 from space_dist import config as configs
+from space_dist.building import make_setup, spec_of
 from space_dist.cli import runs
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, read_instances
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, RunWriter
 from space_dist.planning import plan
-from space_dist.training import make_setup
 from tests import prepared
 from tests.patience import PATIENCE
 from tests.test_learners import interrupted
@@ -180,8 +180,9 @@ def test_columns_of_the_instances_reach_it(example: Path) -> None:
 @pytest.mark.usefixtures("example")
 def test_what_cannot_be_made_is_refused_before_the_run(curriculum: str, words: str) -> None:
     config = chosen(f"curriculum={{kind: custom, {curriculum}}}")
+    spec = spec_of(config)
     with pytest.raises(ConfigError) as refusal:
-        make_setup(config, *read_instances(config))
+        make_setup(config, spec, *read_instances(config, spec.context_bounds))
     assert words in str(refusal.value)
 
 
