@@ -94,9 +94,12 @@ class BatchedPointMass:
 
     def _hit_wall(self, path: FloatArray, gate_x: FloatArray, gate_width: FloatArray) -> NDArray[np.bool_]:
         """Which slots crossed y = 0 outside their gate on `path` (inner + 1, 2, n_slots); they end at the wall."""
-        y_before, y_after = path[:-1, 1], path[1:, 1]
-        crossed = (y_before * y_after <= 0.0) & (y_before != y_after)
         crashed = np.zeros(self.n_slots, dtype=np.bool_)
+        y = path[:, 1]
+        if not ((y.min(axis=0) <= 0.0) & (y.max(axis=0) >= 0.0)).any():  # as in most steps
+            return crashed
+        y_before, y_after = y[:-1], y[1:]
+        crossed = (y_before * y_after <= 0.0) & (y_before != y_after)
         for slot in np.flatnonzero(crossed.any(axis=0)):
             for inner in np.flatnonzero(crossed[:, slot]):
                 (x0, y0), (x1, y1) = path[inner, :, slot], path[inner + 1, :, slot]
@@ -109,6 +112,6 @@ class BatchedPointMass:
         return crashed
 
     def _observe(self) -> NDArray[np.float32]:
-        x, y = self._position
-        vx, vy = self._velocity
-        return np.stack([x, vx, y, vy], axis=1).astype(np.float32)
+        observations = np.empty((self.n_slots, 4), dtype=np.float32)
+        observations[:, ::2], observations[:, 1::2] = self._position.T, self._velocity.T
+        return observations
