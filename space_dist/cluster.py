@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from space_dist.config import GrowingConfig, RunConfig
+from space_dist.config import CurriculumConfig, GrowingConfig, RunConfig
 from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, Selection, State
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, SpaceDistError
@@ -95,12 +95,15 @@ class Cluster(Protocol):
         """Wait for values."""
 
 
-class Central:
-    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state."""
+class Seat:
+    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state.
 
-    def __init__(self, config: RunConfig, train: InstanceSet) -> None:
-        self.curriculum = make_curriculum(config, train)
-        self._from_zero = isinstance(config.curriculum, GrowingConfig) and config.curriculum.v0 == "zero"
+    settings: what the curriculum was made of.
+    """
+
+    def __init__(self, curriculum: Curriculum, settings: CurriculumConfig) -> None:
+        self.curriculum = curriculum
+        self._from_zero = isinstance(settings, GrowingConfig) and settings.v0 == "zero"
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
         """The first decision and V_0."""
@@ -148,6 +151,13 @@ class Central:
         if np.isnan(outcomes.success).any():
             raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
+
+
+class Central(Seat):
+    """The seat of a run's curriculum."""
+
+    def __init__(self, config: RunConfig, train: InstanceSet) -> None:
+        super().__init__(make_curriculum(config, train), config.curriculum)
 
 
 class InProcess:

@@ -38,7 +38,7 @@ from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, mak
 from space_dist.config import GrowingConfig, PPOConfig, RunConfig, TRPOConfig
 from space_dist.curricula import GENERATED, Curriculum, Episodes, Selection, decode_state, encode_state
 from space_dist.envs import BatchedEnv, make_batched
-from space_dist.envs.observations import alike
+from space_dist.envs.interface import knows_success, starts_alike
 from space_dist.episodes import joined_episodes, mean_sizes, summed, told
 from space_dist.errors import ConfigError, Interrupted
 from space_dist.instances import InstanceSet
@@ -147,19 +147,14 @@ def _refuse_wants(config: RunConfig, curriculum: Curriculum) -> None:
 def _knows_success(config: RunConfig, contexts: NDArray[np.float64]) -> bool:
     """Whether a first step in a (1, d) context reports success, true or not."""
     with _failures_explained(config, "reset or a first step"):
-        env = make_env(config)
-        env.action_space.seed(0)
-        env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
-        return env.step(np.asarray(env.action_space.sample())[None]).success is not None
+        return knows_success(make_env(config), contexts)
 
 
 def _starts_alike(config: RunConfig, train: InstanceSet) -> bool:
     """Whether the context leaves no trace in the first observation: with one seed, all instances start the same."""
     slots = min(len(train), _COMPARED_STARTS)
     with _failures_explained(config, "reset"):
-        env = make_env(config, slots)
-        starts = env.reset(np.arange(slots), train.contexts[:slots], np.zeros(slots, dtype=np.uint64))
-    return slots > 1 and alike(starts)
+        return starts_alike(make_env(config, slots), train.contexts[:slots])
 
 
 @contextlib.contextmanager
