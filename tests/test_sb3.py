@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import difflib
 import json
@@ -30,6 +31,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from space_dist import config as configs
+from space_dist.arithmetic import SETTINGS
 from space_dist.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.config import RunConfig
 from space_dist.curricula import Selection
@@ -659,17 +661,30 @@ def test_the_examples_are_a_few_lines_apart_and_shown_as_they_are() -> None:
 def test_the_examples_run_and_import_neither_ray_nor_mlflow(name: str, tmp_path: Path) -> None:
     program = (
         "import json, runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__'); "
-        "print(json.dumps([name for name in ('ray', 'mlflow') if name in sys.modules]))"
+        "print(json.dumps([name for name in ('ray', 'mlflow', 'space_dist.learner') if name in sys.modules]))"
     )
-    environment = {**os.environ, "PYTHONPATH": f"{EXAMPLES}{os.pathsep}{ROOT}", "SPACE_DIST_ARITHMETIC": "native"}
+    environment = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    environment["PYTHONPATH"] = f"{EXAMPLES}{os.pathsep}{ROOT}"
     done = subprocess.run(
         [sys.executable, "-c", program, str(EXAMPLES / f"{name}.py"), "4096"],
         cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == []
     assert ("curriculum/" in done.stdout) == name.endswith("_space")
     assert len(list(tmp_path.glob("*.zip"))) == 1
+
+
+def test_a_script_computes_as_it_did() -> None:
+    """Settings for the same bits everywhere would have its matrix products take several times as long."""
+    program = "import os, stable_baselines3, space_dist.sb3; print(sorted(os.environ))"
+    environment = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not set(SETTINGS).intersection(ast.literal_eval(done.stdout))
 
 
 def test_the_document_is_linked() -> None:
