@@ -53,7 +53,8 @@ def settle() -> None:
     """Make the settings for this process and its children; note what was overruled, and warn of what came too late.
 
     Leaves another kind of CPU alone, and a process that is to be `native`: there the libraries' own choice holds, and
-    `digest` tells it apart.
+    `digest` tells it apart. So it does in somebody's script that has imported Stable-Baselines3 before us, where we are
+    guests: half of the settings would come too late, and the other half have MKL take five times as long for a product.
     """
     if chosen() == "native":
         for name, ours in SETTINGS.items():
@@ -63,6 +64,9 @@ def settle() -> None:
     if not has_reference_cpu():
         return
     before = {name: os.environ.get(name) for name in SETTINGS}
+    if before != SETTINGS and "stable_baselines3" in sys.modules:
+        _late.append("Stable-Baselines3")
+        return
     os.environ.update(SETTINGS)
     _overruled.update(
         {name: given for name, given in before.items() if given is not None and given != SETTINGS[name]}

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from space_dist.config import RunConfig
+from space_dist.config import CurriculumConfig, RunConfig
 from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, Selection, State
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
@@ -94,12 +94,15 @@ class Cluster(Protocol):
         """Wait for values."""
 
 
-class Central:
-    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state."""
+class Seat:
+    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state.
 
-    def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
-        self.curriculum = make_curriculum(config, train, bounds)
-        self._from_zero = config.curriculum.starts_from_zero
+    settings: what the curriculum was made of.
+    """
+
+    def __init__(self, curriculum: Curriculum, settings: CurriculumConfig) -> None:
+        self.curriculum = curriculum
+        self._from_zero = settings.starts_from_zero
 
     def begin(self, *chunks: FloatArray) -> tuple[State, Selection, dict[str, Any], FloatArray]:
         """The first decision and V_0."""
@@ -147,6 +150,13 @@ class Central:
         if np.isnan(outcomes.success).any():
             raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
+
+
+class Central(Seat):
+    """The seat of a run's curriculum."""
+
+    def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
+        super().__init__(make_curriculum(config, train, bounds), config.curriculum)
 
 
 class InProcess:

@@ -15,7 +15,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,38 @@ class Outcomes:
         """Of no episodes."""
         nothing = np.zeros(0)
         return cls(policy_version, nothing, nothing, nothing.astype(np.int64), nothing, nothing)
+
+
+class Route(Protocol):
+    """Which episodes the slots of a shard go on with in a round, and which they begin: `selection`, from `start`."""
+
+    @property
+    def selection(self) -> Selection:
+        """What is walked."""
+
+    @property
+    def start(self) -> int:
+        """The place in `selection` of the next episode."""
+
+    @property
+    def gamma(self) -> float:
+        """Discount per step."""
+
+    @property
+    def seed(self) -> int:
+        """The run's; with `round` and `shard` it decides the episodes' own."""
+
+    @property
+    def round(self) -> int:
+        """Of the run, from 0."""
+
+    @property
+    def shard(self) -> int:
+        """Of the round, from 0."""
+
+    @property
+    def unfinished(self) -> Unfinished | None:
+        """What runs in the slots; None: nothing."""
 
 
 @dataclass(frozen=True)
@@ -302,7 +334,7 @@ class Worker:
         means: FloatArray = values.reshape(-1, self._setup.start_states, *values.shape[1:]).mean(axis=1)
         return means
 
-    def context_values(self, policy: Policy, contexts: FloatArray, version: int) -> FloatArray:
+    def context_values(self, policy: Valuing, contexts: FloatArray, version: int) -> FloatArray:
         """`(m,)` V(s0, c) of any (m, d) contexts: means over start observations whose seeds belong to `version`."""
         setup = self._setup
         if self._scoring is None:
@@ -380,7 +412,7 @@ def collect(
     Raises SpaceDistError if an episode goes on beyond the environment's horizon, or goes another way when played again.
     """
     env, slots = stage.env, stage.env.n_slots // len(rollouts)
-    walk = _Walking(rollouts, slots, length)
+    walk = Walking(rollouts, slots, length)
     acting = side_by_side([rollout.policy for rollout in rollouts], slots)
     noise = Noise.joined([
         Noise.draw(one.policy.head, env.action_space, generator(one.seed, Purpose.ACTIONS, one.round, one.shard),
@@ -396,10 +428,10 @@ def collect(
     actions: list[NDArray[np.generic]] = []
     executed: list[NDArray[np.generic]] = []
     last: list[Observations] = []
-    table = _EpisodeTable(rollouts, slots)
+    table = EpisodeTable(rollouts, slots)
 
     live = stage.resume([rollout.unfinished for rollout in rollouts])
-    current = live if live is not None else _replayed(env, table)
+    current = live if live is not None else replayed(env, table)
     ended = starting = np.flatnonzero(~table.runs)
     for time in range(length):
         if len(ended):
@@ -424,7 +456,7 @@ def collect(
         ended = np.flatnonzero(terminated[time] | truncated[time])
         table.end(ended, time, step.success)
         if table.overdue(time + 1, env.horizon):
-            raise _endless(env)
+            raise endless(env)
         put(current, slice(None), step.observations)
     stored, lasts = np.stack(actions), concatenate(last)
     owners = np.nonzero(truncated[:length])[1] // slots  # of each last observation
@@ -449,7 +481,7 @@ def collect(
     return shards
 
 
-def _replayed(env: BatchedEnv, table: _EpisodeTable) -> Observations:
+def replayed(env: BatchedEnv, table: EpisodeTable) -> Observations:
     """`(n_slots, ...)` the observations that all running episodes have come to, played again; anything in other slots.
 
     Episodes are begun one after another, such that all arrive at the same time. Until its own begins, a slot plays the
@@ -496,17 +528,18 @@ def _another_way(how: str) -> SpaceDistError:
     )
 
 
-def _endless(env: BatchedEnv) -> SpaceDistError:
+def endless(env: BatchedEnv) -> SpaceDistError:
+    """That an episode has gone on beyond its horizon, for users."""
     return SpaceDistError(
         f"the environment does not end its episodes: after its horizon of {env.horizon} steps, neither terminated nor "
         "truncated was set"
     )
 
 
-class _Walking:
+class Walking:
     """Which instance, with which seed, each slot's next episode has, over several rollouts of `slots` slots each."""
 
-    def __init__(self, rollouts: Sequence[Rollout], slots: int, length: int) -> None:
+    def __init__(self, rollouts: Sequence[Route], slots: int, length: int) -> None:
         self._slots = slots
         self.begun = np.zeros(len(rollouts), dtype=np.int64)  # episodes
         self._starts = np.array([rollout.start for rollout in rollouts])
@@ -555,7 +588,7 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
         backward = np.where(alive, gamma * backward + step.rewards, backward)
         time += 1
         if time == env.horizon and (alive & ~(step.terminated | step.truncated)).any():
-            raise _endless(env)
+            raise endless(env)
         returns += np.where(alive, step.rewards, 0.0)
         discounted += np.where(alive, discount * step.rewards, 0.0)
         lengths += alive
@@ -591,14 +624,14 @@ def joined(parts: list[Outcomes]) -> Outcomes:
                                                  for name in fields})  # fmt: skip
 
 
-class _EpisodeTable:
+class EpisodeTable:
     """The episodes that run in the slots of several rollouts, one rollout's after another's, and those that have ended.
 
-    runs: (n_slots,) whether a slot has an episode.  contexts, seeds, returns: (n_slots, ...) of these.
+    runs: (n_slots,) whether a slot has an episode.  ids, contexts, seeds, returns: (n_slots, ...) of these.
     actions: (steps, n_slots, ...) given before this round, as in `Unfinished`.  ended: how many have.
     """
 
-    def __init__(self, rollouts: Sequence[Rollout], slots: int) -> None:
+    def __init__(self, rollouts: Sequence[Route], slots: int) -> None:
         known = [rollout.unfinished or _nothing(rollout, slots) for rollout in rollouts]
 
         def column(name: str) -> NDArray[Any]:
@@ -606,7 +639,7 @@ class _EpisodeTable:
 
         self._slots = slots
         self._gamma = np.repeat([rollout.gamma for rollout in rollouts], slots)
-        self._ids, self.contexts, self.seeds = column("ids"), column("contexts"), column("seeds")
+        self.ids, self.contexts, self.seeds = column("ids"), column("contexts"), column("seeds")
         self.returns, self._discounted, self._discount = (
             column(name) for name in ("returns", "discounted_returns", "discounts")
         )
@@ -629,21 +662,24 @@ class _EpisodeTable:
         return time >= self._due
 
     def begin(self, slots: IntArray, ids: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64], time: int) -> None:
-        self._ids[slots], self.contexts[slots], self.seeds[slots] = ids, contexts, seeds
+        """Have episodes run in `slots` (k,), from step `time` of this round on."""
+        self.ids[slots], self.contexts[slots], self.seeds[slots] = ids, contexts, seeds
         self._starts[slots], self.runs[slots] = time, True
         self.returns[slots], self._discounted[slots], self._discount[slots] = 0.0, 0.0, 1.0
 
     def add(self, rewards: FloatArray) -> None:
+        """Count one step of every slot."""
         self.returns += rewards
         self._discounted += self._discount * rewards
         self._discount *= self._gamma
 
     def end(self, slots: IntArray, time: int, success: NDArray[np.bool_] | None) -> None:
+        """Note that the episodes in `slots` (k,) ended with step `time`."""
         if not len(slots):
             return
         reached = np.full(len(slots), np.nan) if success is None else success[slots].astype(np.float64)
         self._ended.append(
-            (self._ids[slots], self.contexts[slots], slots, np.full(len(slots), time), time + 1 - self._starts[slots],
+            (self.ids[slots], self.contexts[slots], slots, np.full(len(slots), time), time + 1 - self._starts[slots],
              self.returns[slots], self._discounted[slots], reached)
         )  # fmt: skip
         self.runs[slots] = False
@@ -676,7 +712,7 @@ class _EpisodeTable:
             running, steps = runs[mine], int(lengths[mine].max())
             found.append(
                 Unfinished(
-                    ids=np.where(running, self._ids[mine], 0),
+                    ids=np.where(running, self.ids[mine], 0),
                     contexts=np.where(running[:, None], self.contexts[mine], 0.0),
                     seeds=np.where(running, self.seeds[mine], np.uint64(0)), lengths=lengths[mine].copy(),
                     returns=np.where(running, self.returns[mine], 0.0),
@@ -688,7 +724,7 @@ class _EpisodeTable:
         return found
 
 
-def _nothing(rollout: Rollout, slots: int) -> Unfinished:
+def _nothing(rollout: Route, slots: int) -> Unfinished:
     """That no episode runs in a shard's slots."""
     zeros, whole = np.zeros(slots), np.zeros(slots, dtype=np.int64)
     contexts = np.zeros((slots, rollout.selection.contexts.shape[1]))

@@ -93,8 +93,8 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
 
 def test_members_that_stay_together_play_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     configs = [configured(tmp_path / str(number), number) for number in range(3)]
-    played, replayed = [], rollout._replayed
-    monkeypatch.setattr(rollout, "_replayed", lambda env, table: played.append(1) or replayed(env, table))
+    played, replayed = [], rollout.replayed
+    monkeypatch.setattr(rollout, "replayed", lambda env, table: played.append(1) or replayed(env, table))
     together(configs, [tmp_path / f"run{number}" for number in range(3)])
     assert len(played) == 1  # the first round's, of nothing
 

@@ -90,8 +90,8 @@ def test_whoever_goes_on_with_an_episode_gives_the_same_bits(monkeypatch: pytest
 def test_going_on_at_once_plays_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
     one = setup()
     worker, played = Worker(one), []
-    replayed = rollouts_module._replayed
-    monkeypatch.setattr(rollouts_module, "_replayed", lambda env, table: played.append(1) or replayed(env, table))
+    replayed = rollouts_module.replayed
+    monkeypatch.setattr(rollouts_module, "replayed", lambda env, table: played.append(1) or replayed(env, table))
     going_on(one, lambda *_: worker, rounds=5)
     assert len(played) == one.shards  # the first round's, of nothing
 

@@ -23,7 +23,7 @@ app = typer.Typer(
     name="space-dist", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
     help="Self-paced curricula for contextual reinforcement learning.",
 )  # fmt: skip
-for _command in (runs.train, runs.evaluate, runs.explain, runs.report, runs.sync, render):
+for _command in (runs.train, runs.evaluate, runs.explain, runs.report, runs.sync, runs.export_sb3, render):
     app.command()(_command)
 app.add_typer(grid_app, name="grid")
 app.add_typer(slurm_app, name="slurm")

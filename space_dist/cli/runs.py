@@ -1,4 +1,4 @@
-"""Commands about runs: train, evaluate, explain, report, sync."""
+"""Commands about runs: train, evaluate, explain, report, sync, export-sb3."""
 
 from __future__ import annotations
 
@@ -145,6 +145,25 @@ def explain(
     for line in explain_decision(ledger, config, bounds, train, iteration):
         print(line)
     delivered()
+
+
+def export_sb3(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="The zip to write. Default: <name>_s<seed>.zip in the current folder."),
+    ] = None,
+) -> None:
+    """Write a run's policy as a zip that Stable-Baselines3 loads."""
+    from space_dist.export import export_sb3 as export
+    from space_dist.launch import stored_config
+    from space_dist.ledger import Ledger
+
+    ledger = Ledger(run)
+    ledger.status()
+    config = stored_config(ledger)
+    for path, what in export(ledger, out or Path(f"{config.name}_s{config.seed}.zip")):
+        say(f"{path}: {what}")
 
 
 def report(

@@ -49,36 +49,38 @@ for _id in BATCHED:
 
 
 def make_batched(
-    env_id: str, n_slots: int, *, context_visible: bool, kwargs: Mapping[str, Any] = MappingProxyType({})
-) -> BatchedEnv:
-    """Build a batched environment by registered id or by import path (`my_package.my_module:make`).
+    env_id: str | Callable[..., Any], n_slots: int, *, context_visible: bool,
+    kwargs: Mapping[str, Any] = MappingProxyType({}),
+) -> BatchedEnv:  # fmt: skip
+    """Build a batched environment by registered id, by import path (`my_package.my_module:make`), or by a function.
 
-    A function at an import path that takes a number of slots (a parameter `n_slots`, or one without a default that
+    A function that takes a number of slots (a parameter `n_slots`, or one without a default that
     `kwargs` does not give) is called with it and `kwargs`, and returns a `BatchedEnv`. Any other is called with
     `kwargs` alone and returns a `gymnasium.Env`, of which `BatchedSingles` makes a batch; `horizon` in `kwargs` is
     then for that, unless the function has a parameter of this name. Classes of CARL's are wrapped in `CarlEnv`.
 
     Raises ConfigError if there is no such environment, or none with such arguments.
     """
-    make = _find(env_id)
+    make = env_id if callable(env_id) else _find(env_id)
+    where = _named(env_id)
     try:
         if _takes_slots(make, kwargs):
-            _refuse_arguments(env_id, make, (n_slots,), kwargs)
+            _refuse_arguments(where, make, (n_slots,), kwargs)
             env = make(n_slots, **kwargs)
         else:
             own = dict(kwargs)
-            horizon = None if takes_argument(env_id, "horizon") else own.pop("horizon", None)
-            _refuse_arguments(env_id, make, (), own)
+            horizon = None if _takes(make, "horizon") else own.pop("horizon", None)
+            _refuse_arguments(where, make, (), own)
             env = make(**own)
             if isinstance(env, gym.Env):
                 # The first is here already; the others must be its equals and not itself.
                 ready = [env]
                 env = BatchedSingles(n_slots, lambda: ready.pop() if ready else make(**own), horizon)
     except ConfigError as error:
-        raise ConfigError(f"env.id {env_id!r}: {error}") from None
+        raise ConfigError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
-        raise ConfigError(f"env.id {env_id!r} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
-    _refuse_interface(env_id, env)
+        raise ConfigError(f"{where} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
+    _refuse_interface(where, env)
     batched: BatchedEnv = env
     return ContextVisible(batched) if context_visible else batched
 
@@ -90,8 +92,19 @@ def unwrapped(env: BatchedEnv) -> BatchedEnv:
 
 def takes_argument(env_id: str, name: str) -> bool:
     """Whether the function or class behind an id has a parameter of this name."""
+    return _takes(_find(env_id), name)
+
+
+def _named(env_id: str | Callable[..., Any]) -> str:
+    """What sentences call an environment."""
+    if isinstance(env_id, str):
+        return f"env.id {env_id!r}"
+    return f"the environment {getattr(env_id, '__qualname__', repr(env_id))}"
+
+
+def _takes(make: Callable[..., Any], name: str) -> bool:
     try:
-        return name in inspect.signature(_find(env_id)).parameters
+        return name in inspect.signature(make).parameters
     except (TypeError, ValueError):  # written in C
         return False
 
@@ -135,31 +148,31 @@ def _takes_slots(make: Callable[..., Any], kwargs: Mapping[str, Any]) -> bool:
 
 
 def _refuse_arguments(
-    env_id: str, make: Callable[..., Any], positional: tuple[int, ...], kwargs: Mapping[str, Any]
+    where: str, make: Callable[..., Any], positional: tuple[int, ...], kwargs: Mapping[str, Any]
 ) -> None:
     if not kwargs:
         return
     try:
         inspect.signature(make).bind(*positional, **kwargs)
     except TypeError as error:
-        raise ConfigError(f"env.kwargs: {env_id} cannot be made with them: {error}") from None
+        raise ConfigError(f"env.kwargs: {where.removeprefix('env.id ')} cannot be made with them: {error}") from None
 
 
-def _refuse_interface(env_id: str, env: Any) -> None:
+def _refuse_interface(where: str, env: Any) -> None:
     if isinstance(env, gym.Env):
         raise ConfigError(
-            f"env.id {env_id!r} was called with a number of slots and returned one gymnasium.Env; the function of a "
+            f"{where} was called with a number of slots and returned one gymnasium.Env; the function of a "
             "single environment needs no argument but those in env.kwargs"
         )
     if isinstance(env, gym.vector.VectorEnv):
         raise ConfigError(
-            f"env.id {env_id!r} made a Gymnasium vector environment, which resets by itself and so with no context; "
+            f"{where} made a Gymnasium vector environment, which resets by itself and so with no context; "
             "return a single gymnasium.Env instead"
         )
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
                if not hasattr(env, name)]  # fmt: skip
     if missing:
-        raise ConfigError(f"env.id {env_id!r} made a {type(env).__name__} without {', '.join(missing)}")
+        raise ConfigError(f"{where} made a {type(env).__name__} without {', '.join(missing)}")
     wanted: dict[str, tuple[type, str]] = {
         "horizon": (int, "a whole number of steps, at least 1"),
         "context_bounds": (ContextBounds, "ContextBounds"),
@@ -169,7 +182,7 @@ def _refuse_interface(env_id: str, env: Any) -> None:
     for name, (kind, what) in wanted.items():
         value: Any = getattr(env, name)
         if not isinstance(value, kind) or (name == "horizon" and env.horizon < 1):
-            raise ConfigError(f"env.id {env_id!r}: its {name} must be {what}, not {str(value)[:80]!r}")
+            raise ConfigError(f"{where}: its {name} must be {what}, not {str(value)[:80]!r}")
 
 
 def _find(env_id: str) -> Callable[..., Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.observations import Observations
+from space_dist.envs.observations import Observations, alike
 from space_dist.instances import ContextBounds
 
 log = logging.getLogger("space_dist")
@@ -164,3 +164,17 @@ class ContextVisible:
         if isinstance(self.observation_space, spaces.Dict):
             return {"observation": observations, "context": context}
         return np.concatenate([observations.astype(np.float32, copy=False), context], axis=1)
+
+
+def starts_alike(env: BatchedEnv, contexts: FloatArray) -> bool:
+    """Whether (n_slots, d) contexts leave no trace in the first observation: with one seed, all start the same."""
+    slots = len(contexts)
+    starts = env.reset(np.arange(slots), contexts, np.zeros(slots, dtype=np.uint64))
+    return slots > 1 and alike(starts)
+
+
+def knows_success(env: BatchedEnv, contexts: FloatArray) -> bool:
+    """Whether a first step of an environment with one slot, in a (1, d) context, reports success, true or not."""
+    env.action_space.seed(0)
+    env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
+    return env.step(np.asarray(env.action_space.sample())[None]).success is not None

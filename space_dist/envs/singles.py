@@ -47,11 +47,19 @@ class BatchedSingles:
         self._time = np.zeros(n_slots, dtype=np.int64)
         self._observations = allocate(self.observation_space, n_slots)
         self._tells_success: bool | None = None  # until the first episode has ended
+        self.infos: list[dict[str, Any]] = [{} for _ in range(n_slots)]
+        """Of the last step, by slot, as the environments told them."""
 
     @property
     def first(self) -> gym.Env[Any, Any]:
         """The environment of slot 0."""
         return self._envs[0]
+
+    def single(self, slot: int) -> gym.Env[Any, Any]:
+        """The environment of a slot."""
+        if slot not in self._envs:
+            self._envs[slot] = self._another()
+        return self._envs[slot]
 
     @property
     def whole_contexts(self) -> bool:
@@ -61,12 +69,10 @@ class BatchedSingles:
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
         """Start new episodes. Raises SpaceDistError where the environment breaks its word."""
         for slot, context, seed in zip(slots.tolist(), contexts, seeds.tolist(), strict=True):
-            if slot not in self._envs:
-                self._envs[slot] = self._another()
             given = context.astype(self._context_space.dtype)
             if self.whole_contexts and (given != context).any():
                 raise SpaceDistError(f"the context {context.tolist()} must hold whole numbers, as context_space says")
-            observation, _ = self._envs[slot].reset(seed=seed, options={"context": given})
+            observation, _ = self.single(slot).reset(seed=seed, options={"context": given})
             self._keep(slot, observation)
         self._time[slots] = 0
         return take(self._observations, slots)
@@ -82,6 +88,7 @@ class BatchedSingles:
             action = int(actions[slot]) if actions.ndim == 1 else np.array(actions[slot])
             observation, rewards[slot], ended, cut, info = self._envs[slot].step(action)
             self._keep(slot, observation)
+            self.infos[slot] = info
             terminated[slot] = ended
             truncated[slot] = (cut or self._time[slot] >= self.horizon) and not ended
             found = [info[key] for key in SUCCESS_KEYS if key in info]

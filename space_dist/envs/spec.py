@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from gymnasium import spaces
 
 from space_dist.envs import BatchedEnv, close, make_batched
-from space_dist.envs.interface import FloatArray
-from space_dist.envs.observations import alike
+from space_dist.envs.interface import FloatArray, knows_success, starts_alike
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
 
@@ -57,19 +55,15 @@ class EnvironmentSpec:
         Raises ConfigError if the environment fails.
         """
         with self._failures_explained("reset or a first step"), self.opened(1) as env:
-            env.action_space.seed(0)
-            env.reset(np.zeros(1, dtype=np.int64), contexts, np.zeros(1, dtype=np.uint64))
-            return env.step(np.asarray(env.action_space.sample())[None]).success is not None
+            return knows_success(env, contexts)
 
     def starts_alike(self, contexts: FloatArray) -> bool:
         """Whether (n, d) contexts leave no trace in the first observation: with one seed, they all start the same.
 
         A single one has nothing to be told from. Raises ConfigError if the environment fails.
         """
-        n = len(contexts)
-        with self._failures_explained("reset"), self.opened(n) as env:
-            starts = env.reset(np.arange(n), contexts, np.zeros(n, dtype=np.uint64))
-        return n > 1 and alike(starts)
+        with self._failures_explained("reset"), self.opened(len(contexts)) as env:
+            return starts_alike(env, contexts)
 
     @contextlib.contextmanager
     def _failures_explained(self, what: str) -> Iterator[None]:

@@ -1,0 +1,93 @@
+"""A run's policy as a zip that Stable-Baselines3 loads: for scripts that know nothing of this package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecNormalize
+
+from space_dist.building import learner_of, spec_of
+from space_dist.config import GrowingConfig, RunConfig
+from space_dist.envs.spec import EnvironmentSpec
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.instances import read_csv
+from space_dist.launch import stored_config
+from space_dist.learner import SB3Learner
+from space_dist.ledger import Checkpoint, Ledger
+from space_dist.policy import OBSERVATION_CLIP
+from space_dist.sb3 import ContextVecEnv
+
+_ALGORITHMS = {
+    "ppo": "stable_baselines3.PPO", "a2c": "stable_baselines3.A2C", "dqn": "stable_baselines3.DQN",
+    "sac": "stable_baselines3.SAC", "td3": "stable_baselines3.TD3", "trpo": "sb3_contrib.TRPO",
+}  # fmt: skip
+
+
+def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
+    """Write a run's last policy to the zip `out`; returns each file and what it is.
+
+    The zip holds SB3's own model: networks, optimisers and counters, of which `load` makes one that acts on the same
+    observations (with the context, where the run shows it) as the run's policy does, and can go on learning. A run that
+    normalises leaves SB3's VecNormalize beside it, and one of several policies a zip of each, with its number.
+
+    Raises LedgerError where the run has no checkpoint, ConfigError where the files cannot be written.
+    """
+    config, checkpoint = stored_config(ledger), ledger.last_checkpoint()
+    if checkpoint is None:
+        raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
+    out = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
+    spec = spec_of(config)
+    kind, written = _ALGORITHMS[config.learner.kind], []
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        for member in range(config.members):
+            learner = _stock_learner(config, spec, checkpoint, member)
+            path = out if config.members == 1 else out.with_name(f"{out.stem}_{member}.zip")
+            model: Any = learner.model
+            model.num_timesteps = int(checkpoint.data["run"]["steps"])
+            model.save(path)
+            written.append((path, f"{kind}.load takes it"))
+            if learner.normalises:
+                beside = out.with_name(f"{out.stem}_vecnormalize.pkl")
+                _normaliser(config, spec, ledger, learner).save(str(beside))
+                written.append((beside, "VecNormalize.load takes it; the policy acts on what it normalises"))
+    except OSError as error:
+        raise ConfigError(f"{out} cannot be written: {error.strerror}") from None
+    return written
+
+
+def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpoint, member: int) -> SB3Learner:
+    """A policy's learner as SB3 itself has it, whatever computed the run's updates: their states are the same."""
+    changes: dict[str, Any] = {"engine": "single", "device": "cpu"}
+    if "update" in type(config.learner).model_fields:
+        changes["learner"] = config.learner.model_copy(update={"update": "stock"})
+    if isinstance(config.curriculum, GrowingConfig):
+        changes["curriculum"] = config.curriculum.model_copy(update={"aggregate": "own"})
+    learner = learner_of(config.model_copy(update=changes), spec)
+    if not isinstance(learner, SB3Learner):
+        raise TypeError(f"one policy has one learner, not {type(learner).__name__}")
+    several = config.members > 1
+    prefix, data = f"learner/{member}/" if several else "learner/", checkpoint.data["learner"]
+    arrays = {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
+    learner.load(arrays, data[str(member)] if several else data)
+    return learner
+
+
+def _normaliser(config: RunConfig, spec: EnvironmentSpec, ledger: Ledger, learner: SB3Learner) -> VecNormalize:
+    """SB3's, with the run's scales, which stand still."""
+    train = read_csv(ledger.instances("train"), spec.context_bounds, config.curriculum.columns_read)
+    settings, statistics = config.learner, learner.statistics
+    env = ContextVecEnv(
+        config.env.id, train, context_visible=config.env.context_visible, env_kwargs=config.env.kwargs
+    )  # fmt: skip
+    made = VecNormalize(
+        env, training=False, norm_obs=settings.normalize_observations, norm_reward=settings.normalize_rewards,
+        clip_obs=OBSERVATION_CLIP, gamma=settings.gamma, epsilon=0.0,
+    )  # fmt: skip
+    if statistics.mean is not None and statistics.std is not None:
+        scales: Any = made.obs_rms
+        scales.mean, scales.var = statistics.mean, np.square(statistics.std)
+    made.ret_rms.var = np.asarray(statistics.reward_std**2)
+    return made

@@ -1,0 +1,333 @@
+"""A vectorised environment of Stable-Baselines3's, each of whose episodes is played on an instance.
+
+SB3's own reset an environment as soon as its episode has ended, with nothing that could tell it a context. This one
+chooses the context first: by the round that a `CurriculumCallback` has begun, or, where there is none, by walking over
+all instances. It keeps the books that `rollout.collect` keeps, so that what a curriculum is told is the same.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from space_dist.curricula import Selection
+from space_dist.envs import BatchedEnv, BatchedSingles, Drawable, make_batched, unwrapped
+from space_dist.envs.interface import Closable
+from space_dist.envs.observations import Observations, allocate, concatenate, put, take
+from space_dist.errors import ConfigError
+from space_dist.instances import ContextBounds, InstanceSet, read_csv
+from space_dist.rollout import EpisodeTable, Shard, Stage, Walking, endless, replayed
+from space_dist.walk import Unfinished
+
+_FREE = 1 << 32  # the first round of an environment that nobody drives; no run has so many
+_FREE_STEPS = 1024  # of such a round
+
+
+@dataclass(frozen=True)
+class Course:
+    """A round of one shard: see `rollout.Route`."""
+
+    selection: Selection
+    start: int
+    gamma: float
+    seed: int
+    round: int
+    unfinished: Unfinished | None = None
+    shard: int = 0
+
+
+class ContextVecEnv(VecEnv):
+    """`n_envs` copies of an environment, stepped one after another, as in SB3's DummyVecEnv; episodes are on instances.
+
+    env: a class or function that makes a `gymnasium.Env` with a `context_space`, whose `reset` takes
+        `options={"context": array}` (docs/your_environment.md), or a batched one; or its id, as `env.id` of a config.
+    instances: a CSV file, an `InstanceSet`, or an (n, d) array of contexts in environment units, one row an instance
+        (ids are 0, 1, ... then; (n,) where a context is one number).
+    n_envs: how many episodes run at once.
+    seed: with the instance and the round it decides each episode's own. SB3's `seed=` of a model takes its place.
+    context_visible: whether observations end with the context, scaled from its bounds to [-1, 1].
+    columns: further columns of a CSV file, for curricula that read one.
+    env_kwargs: arguments of the environment.
+
+    While a `CurriculumCallback` trains on it, the callback chooses the instances. Otherwise episodes walk over all
+    instances by id, from the first at every `reset`: so an environment of test instances, given to SB3's
+    `evaluate_policy` with as many episodes as there are instances, has each played once, and the same each time.
+
+    An info holds what the environment told, and at the end of an episode `instance` (its id, -1 for a generated
+    context), `context` (d,), `episode` as SB3's Monitor tells it, and `is_success` where the environment knows success.
+
+    Raises ConfigError if environment or instances cannot be used.
+    """
+
+    def __init__(
+        self,
+        env: str | Callable[..., Any],
+        instances: InstanceSet | Path | str | ArrayLike,
+        n_envs: int = 1,
+        *,
+        seed: int = 0,
+        context_visible: bool = True,
+        columns: Sequence[str] = (),
+        env_kwargs: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        if not isinstance(env, str) and not callable(env):
+            raise ConfigError(
+                f"ContextVecEnv: env is a {type(env).__name__}; give the class, a function that makes one environment "
+                "at each call, or an id"
+            )
+        if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
+            raise ConfigError(f"ContextVecEnv: n_envs must be a whole number of at least 1, not {n_envs!r}")
+        self._env, self._kwargs, self.context_visible = env, env_kwargs, context_visible
+        batched = self.make_batched(n_envs)
+        self.bounds = batched.context_bounds
+        self.instances = _instances(instances, self.bounds, columns)
+        self.run_seed = seed
+        self.horizon = batched.horizon
+        self._batched, self._stage = batched, Stage(batched)
+        super().__init__(n_envs, batched.observation_space, batched.action_space)
+        self._began = time.time()
+        self._actions: NDArray[Any] = np.zeros(0)
+        self._free_rounds, self._free_start = 0, 0
+        self._current: Observations = allocate(batched.observation_space, n_envs)
+        self.driven = False
+        """Whether a callback chooses the instances of the round that is played."""
+        self.time = self._length = 0  # as if a round were over: whoever steps before a reset begins another
+        self._ended = True
+        self._left: Unfinished | None = None
+
+    def make_batched(self, n_slots: int) -> BatchedEnv:
+        """Another such environment, with `n_slots` slots."""
+        return make_batched(self._env, n_slots, context_visible=self.context_visible, kwargs=self._kwargs)
+
+    # ---- rounds ----
+
+    def begin_round(self, course: Course, *, length: int, record: bool = False, driven: bool = True) -> Observations:
+        """Go on with what of `course` is unfinished, and play its selection, for `length` steps of all slots at most.
+
+        record: keep the observations. Returns (n_envs, ...) where all slots stand. Raises SpaceDistError if an episode
+        that has to be played again goes another way.
+        """
+        env, slots = self._batched, self.num_envs
+        self.course, self._length, self._record, self.driven = course, length, record, driven
+        self._ended, self._left = False, course.unfinished
+        self._walking = Walking([course], slots, length + 1)  # what ends with the last step begins another
+        self._table = EpisodeTable([course], slots)
+        self.time = 0
+        self._observed: list[Observations] = []
+        self._truncated_observed: list[Observations] = []
+        self._executed: list[NDArray[Any]] = []
+        self._steps: list[tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]] = []
+        live = self._stage.resume([course.unfinished])
+        self._current = live if live is not None else replayed(env, self._table)
+        self.starts = ~self._table.runs
+        """(n_envs,) whether a slot's first step in this round begins an episode."""
+        self._start(np.flatnonzero(self.starts))
+        return take(self._current, slice(None))
+
+    def end_round(self) -> Shard:
+        """What was played since `begin_round`, as the one shard of a round.
+
+        Episodes that had begun and made no step are not part of it: the next round begins others in their slots.
+        Observations have length 0 where they were not recorded.
+        """
+        table, length, course = self._table, len(self._executed), self.course
+        fresh = table.runs & (table.lengths(length) == 0)
+        table.runs[fresh] = False
+        (episodes,) = table.episodes(1)
+        (unfinished,) = table.unfinished(1, np.stack(self._executed))
+        rewards, terminated, truncated = (np.stack(column) for column in zip(*self._steps, strict=True))
+        space, slots = self._batched.observation_space, self.num_envs
+        observations = allocate(space, len(self._observed), slots)
+        for at, observed in enumerate(self._observed):
+            put(observations, at, observed)
+        lasts = self._truncated_observed
+        self._stage.leave([unfinished], self._current)
+        self.driven, self._ended, self._length, self._left = False, True, length, unfinished
+        return Shard(
+            shard=course.shard, round=course.round, policy_version=course.round,
+            selection_version=course.selection.version, order_version=course.selection.order_version,
+            observations=observations, actions=np.stack(self._executed), rewards=rewards, terminated=terminated,
+            truncated=truncated, starts=self.starts, last_observations=take(self._current, slice(None)),
+            truncated_observations=concatenate(lasts) if lasts else allocate(space, 0), next_observations=None,
+            episodes=episodes, begun=int(self._walking.begun[0] - fresh.sum()), unfinished=unfinished,
+        )  # fmt: skip
+
+    def _walk_on(self, unfinished: Unfinished | None) -> None:
+        """Begin a round that nobody drives."""
+        ids, contexts = self.instances.ids, self.instances.contexts
+        course = Course(
+            Selection(0, ids, contexts, 0), self._free_start, 1.0, self.run_seed, _FREE + self._free_rounds, unfinished
+        )
+        self._free_rounds += 1
+        self.begin_round(course, length=_FREE_STEPS, driven=False)
+
+    def _start(self, slots: NDArray[np.int64]) -> None:
+        """Begin the next episodes of the course in `slots` (k,), which ascend."""
+        if not len(slots):
+            return
+        ids, contexts, seeds = self._walking.next(slots)
+        put(self._current, slots, self._batched.reset(slots, contexts, seeds))
+        self._table.begin(slots, ids, contexts, seeds, self.time)
+
+    # ---- what SB3 asks of a VecEnv ----
+
+    def reset(self) -> VecEnvObs:
+        """Begin new episodes in all slots, on the first instances. A round that was being played is over."""
+        self._stage.leave([], self._current)
+        self._free_rounds, self._free_start = 0, 0
+        self._walk_on(None)
+        self._reset_seeds()
+        self._reset_options()
+        return take(self._current, slice(None))
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """See `VecEnv`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One step of every slot; where an episode ends, the next one begins at once, on its own instance."""
+        if self.time == self._length:  # of a round that is over, and nobody has begun another
+            if not self._ended:
+                free, shard = not self.driven, self.end_round()
+                self._free_start = (self._free_start + free * shard.begun) % len(self.instances)
+            self._walk_on(self._left)
+        env, table, at = self._batched, self._table, self.time
+        actions = np.array(self._actions)
+        step = env.step(actions)
+        terminated, truncated = step.terminated, step.truncated & ~step.terminated
+        if self._record:
+            self._observed.append(take(self._current, slice(None)))
+            self._truncated_observed.append(take(step.observations, truncated))
+        self._executed.append(actions)
+        self._steps.append((step.rewards, terminated, truncated))
+        table.add(step.rewards)
+        dones = terminated | truncated
+        ended = np.flatnonzero(dones)
+        table.end(ended, at, step.success)
+        if table.overdue(at + 1, env.horizon):
+            raise endless(env)
+        infos = self._infos(truncated)
+        for slot in ended.tolist():
+            infos[slot] |= {
+                "terminal_observation": take(step.observations, slot),
+                "instance": int(table.ids[slot]),
+                "context": table.contexts[slot].copy(),
+                "episode": {
+                    "r": float(table.returns[slot]),
+                    "l": int(table.lengths(at)[slot]) + 1,
+                    "t": round(time.time() - self._began, 6),
+                },
+            }
+            if step.success is not None:
+                infos[slot]["is_success"] = bool(step.success[slot])
+        self.time = at + 1
+        put(self._current, slice(None), step.observations)
+        self._start(ended)
+        return take(self._current, slice(None)), step.rewards.astype(np.float32), dones, infos
+
+    def _infos(self, truncated: NDArray[np.bool_]) -> list[dict[str, Any]]:
+        env = unwrapped(self._batched)
+        told: Sequence[Mapping[str, Any]] = env.infos if isinstance(env, BatchedSingles) else [{}] * self.num_envs
+        return [{**info, "TimeLimit.truncated": bool(cut)} for info, cut in zip(told, truncated, strict=True)]
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Have `seed` decide the seeds of all episodes to come."""
+        if seed is not None:
+            self.run_seed = seed
+        return [seed] * self.num_envs
+
+    def close(self) -> None:
+        """Free what the environments hold."""
+        env = unwrapped(self._batched)
+        if isinstance(env, BatchedSingles):
+            for slot in range(self.num_envs):
+                env.single(slot).close()
+        elif isinstance(env, Closable):
+            env.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """See `VecEnv`."""
+        if attr_name == "render_mode" and not isinstance(unwrapped(self._batched), BatchedSingles):
+            return [None for _ in self._get_indices(indices)]
+        return [
+            one.get_wrapper_attr(attr_name) if isinstance(one, gym.Env) else getattr(one, attr_name)
+            for one in self._targets(indices)
+        ]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """See `VecEnv`."""
+        for one in self._targets(indices):
+            setattr(one, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """See `VecEnv`."""
+        return [method(*args, **kwargs) for method in self.get_attr(method_name, indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """See `VecEnv`. Episodes are told as SB3's Monitor tells them, so it counts as there."""
+        return [
+            wrapper_class is Monitor or (isinstance(one, gym.Env) and is_wrapped(one, wrapper_class))
+            for one in self._targets(indices)
+        ]
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """What every slot's environment draws of itself."""
+        env = unwrapped(self._batched)
+        return [env.frame(slot) if isinstance(env, Drawable) else None for slot in range(self.num_envs)]
+
+    def _targets(self, indices: VecEnvIndices) -> list[Any]:
+        """The single environments, or the batched one as often as it is asked for."""
+        env = unwrapped(self._batched)
+        return [env.single(slot) if isinstance(env, BatchedSingles) else env for slot in self._get_indices(indices)]
+
+
+def _instances(
+    given: InstanceSet | Path | str | ArrayLike, bounds: ContextBounds, columns: Sequence[str]
+) -> InstanceSet:
+    """What was given as an instance set. Raises ConfigError if it does not belong to these bounds."""
+    if isinstance(given, str | Path):
+        return read_csv(Path(given), bounds, columns)
+    d = len(bounds.names)
+    if isinstance(given, InstanceSet):
+        instances = given
+    else:
+        try:
+            contexts = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigError(
+                f"ContextVecEnv: instances is a {type(given).__name__}; give a CSV file, an InstanceSet, or an array "
+                "of numbers with one row an instance"
+            ) from None
+        contexts = contexts[:, None] if contexts.ndim == 1 and d == 1 else contexts
+        if contexts.ndim != 2 or contexts.shape[1] != d:
+            raise ConfigError(
+                f"ContextVecEnv: instances has the shape {contexts.shape}; it needs one row an instance and {d} "
+                f"columns, one for each of {', '.join(bounds.names)}"
+            )
+        instances = InstanceSet(np.arange(len(contexts)), contexts, bounds.names)
+    if instances.names != bounds.names:
+        raise ConfigError(
+            f"ContextVecEnv: the instances' features are {', '.join(instances.names)}, the environment's are "
+            f"{', '.join(bounds.names)}"
+        )
+    outside = np.argwhere((instances.contexts < bounds.low) | (instances.contexts > bounds.high))
+    if len(outside):
+        row, feature = outside[0]
+        raise ConfigError(
+            f"ContextVecEnv: instance {instances.ids[row]} has {bounds.names[feature]} = "
+            f"{instances.contexts[row, feature]:g}, outside its bounds [{bounds.low[feature]:g}, "
+            f"{bounds.high[feature]:g}]"
+        )
+    return instances

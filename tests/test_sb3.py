@@ -1,0 +1,702 @@
+"""Our curricula in a script with Stable-Baselines3: they decide as our loop does, and go on as a model remembers."""
+
+from __future__ import annotations
+
+import ast
+import base64
+import difflib
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+from space_dist import config as configs
+from space_dist.arithmetic import SETTINGS
+from space_dist.building import learner_of, spec_of
+from space_dist.cluster import Decision, Evidence, Handle, InProcess
+from space_dist.config import RunConfig
+from space_dist.curricula import Selection
+from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.instances import InstanceSet
+from space_dist.interrupts import StopRequests
+from space_dist.launch import begun
+from space_dist.learner import SB3Learner
+from space_dist.ledger import Checkpoint, decode_checkpoint
+from space_dist.rollout import Outcomes, Shard
+from space_dist.sb3 import ContextVecEnv, CurriculumCallback
+from space_dist.sb3.callback import STATE
+from space_dist.sb3.script import Scored, Wrapped
+from tests.faulty_env import Honest
+from tests.patience import PATIENCE
+from tests.test_learners import LEARNERS, OFF_POLICY
+from tests.test_purity import ROOT
+
+EXAMPLES, DOCUMENT = ROOT / "docs" / "examples", ROOT / "docs" / "sb3.md"
+LINE, DISCRETE, PARTS = "tests.tiny_env:make", "tests.tiny_env:make_discrete", "tests.tiny_env:make_dict"
+TARGETS = np.array([-0.75, 0.75, 0.4, -0.3, 0.1, -0.5])
+SLOTS, STEPS, ROUNDS, SEED = 4, 40, 7, 3  # ten steps a slot: episodes, of four or eight, go on from round to round
+SPACE = {"kind": "space", "eta": 0.4}
+
+
+# ---- the same decisions as our loop's ----
+
+
+class Witness(InProcess):
+    """Our own cluster, and everything that a script would have to be shown to decide alike."""
+
+    learner: SB3Learner
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.selections: list[Selection] = []  # of each round
+        self.shards: list[Shard] = []
+        self.learned: list[Any] = []  # the learner as each round began
+        self.advantages: list[NDArray[np.float64] | None] = []
+        self.decisions: list[Decision] = []
+        self.probed: dict[int, list[Outcomes]] = {}
+
+    def collect(self, *arguments: Any, **named: Any) -> list[Handle]:
+        shards = super().collect(*arguments, **named)
+        self.selections.append(arguments[1])
+        self.shards += shards
+        self.learned.append(self.learner.save())
+        return shards
+
+    def probe(self, policy: Handle, indices: Any, *, version: int) -> list[Handle]:
+        self.probed[version] = super().probe(policy, indices, version=version)
+        return self.probed[version]
+
+    def begin(self, values: Any) -> Decision:
+        self.decisions.append(super().begin(values))
+        return self.decisions[-1]
+
+    def decide(self, state: Handle, before: Handle, evidence: Evidence, **asked: Any) -> Decision:
+        self.decisions.append(super().decide(state, before, evidence, **asked))
+        return self.decisions[-1]
+
+
+def run_config(
+    folder: Path, kind: str, env: Mapping[str, Any], curriculum: Mapping[str, Any], **learner: Any
+) -> RunConfig:
+    folder.mkdir(exist_ok=True)
+    train, test = folder / "train.csv", folder / "test.csv"
+    train.write_text("id,target\n" + "".join(f"{number + 10},{target}\n" for number, target in enumerate(TARGETS)))
+    test.write_text("id,target\n0,-0.7\n")
+    off_policy = {**OFF_POLICY, "buffer_size": 1000} if kind in ("dqn", "sac", "td3") else {}
+    data = {
+        "name": "tiny", "seed": SEED, "env": dict(env), "instances": {"train": str(train), "test": str(test)},
+        "curriculum": dict(curriculum),
+        "learner": {"kind": kind, "n_steps": STEPS, "net_arch": [16], **off_policy, **LEARNERS[kind], **learner},
+        "rollout": {"shards": 1, "slots": SLOTS}, "budget": {"steps": ROUNDS * STEPS},
+        "evaluation": {"every_steps": 10**6}, "tracking": {"uri": None}, "resources": {"workers": 0},
+    }  # fmt: skip
+    return configs.parse(data, "test")
+
+
+def witnessed(config: RunConfig, folder: Path) -> Witness:
+    """Our own loop's run of a config."""
+    with begun(config, folder, resume=False, stop=StopRequests()) as course:
+        witness = Witness(course.config, course.setup)
+        training = course.training(witness)
+        assert isinstance(training.learner, SB3Learner)
+        witness.learner, update = training.learner, training.learner.update
+
+        def noting(*arguments: Any, **named: Any) -> Any:
+            found = update(*arguments, **named)
+            witness.advantages.append(found.advantages)
+            return found
+
+        training.learner.update = noting  # type: ignore[method-assign]
+        training.run()
+        witness.learned.append(training.learner.save())
+    return witness
+
+
+def replay(config: RunConfig, witness: Witness, callback: CurriculumCallback) -> None:
+    """Have a script's model do what our loop's did: the same actions, and behind each round the same weights.
+
+    What the environment answers must be the same then, and every selection, and the values behind it.
+    """
+    twin = learner_of(config, spec_of(config))
+    assert isinstance(twin, SB3Learner)
+    model = twin.model
+    instances = InstanceSet(np.arange(len(TARGETS)) + 10, TARGETS[:, None], ("target",))
+    env = ContextVecEnv(config.env.id, instances, SLOTS, seed=config.seed, env_kwargs=config.env.kwargs)
+    model.env, model.n_envs = env, SLOTS
+    if isinstance(model, OffPolicyAlgorithm):
+        model.train_freq = TrainFreq(STEPS // SLOTS, TrainFrequencyUnit.STEP)
+    _, started = model._setup_learn(config.budget.steps, callback)
+    head = twin.policy(0).head
+    twin.load(*witness.learned[0])
+    started.on_training_start({}, {})
+    decided = iter(witness.decisions)
+    known = next(decided)
+    for number, shard in enumerate(witness.shards):
+        started.on_rollout_start()
+        if callback.selection.version != known.selection.version:
+            known = next(decided)
+            assert callback.numbers.keys() == known.numbers.keys()
+        same_selection(callback.selection, witness.selections[number])
+        np.testing.assert_allclose(callback.values, known.values, rtol=1e-5, atol=1e-6)
+        # What our loop has torch compute as well, but for NumPy's tanh of SAC's and TD3's actions.
+        if config.learner.policy == "MultiInputPolicy" and config.learner.kind not in ("sac", "td3"):
+            assert callback.values.tobytes() == known.values.tobytes()
+            assert callback.numbers == known.numbers
+        for at, actions in enumerate(shard.actions):
+            _, rewards, dones, _ = env.step(head.executed(actions))
+            model.num_timesteps += SLOTS
+            assert rewards.tolist() == shard.rewards[at].astype(np.float32).tolist()
+            assert dones.tolist() == (shard.terminated[at] | shard.truncated[at]).tolist()
+            assert started.on_step()
+        sizes = witness.advantages[number]
+        if sizes is not None:
+            model.rollout_buffer.advantages = sizes.astype(np.float32)
+        started.on_rollout_end()
+        twin.load(*witness.learned[number + 1])
+    started.on_training_end()
+    last = witness.decisions[-1]
+    same_selection(callback.selection, last.selection)
+    np.testing.assert_allclose(callback.values, last.values, rtol=1e-5, atol=1e-6)
+    assert len(list(decided)) <= 1  # the one behind the last round
+
+
+def same_selection(one: Selection, other: Selection) -> None:
+    assert (one.version, one.order_version, one.drawn) == (other.version, other.order_version, other.drawn)
+    assert one.ids.tolist() == other.ids.tolist()
+    assert one.contexts.tobytes() == other.contexts.tobytes()
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+@pytest.mark.parametrize("flat", [True, False])
+def test_spaces_decisions_are_our_loops_for_every_learner(kind: str, flat: bool, tmp_path: Path) -> None:
+    policy = "MlpPolicy" if flat else "MultiInputPolicy"
+    env: dict[str, Any] = {"id": (DISCRETE if kind == "dqn" else LINE) if flat else PARTS}
+    env |= {} if flat else {"kwargs": {"discrete": kind == "dqn"}}
+    config = run_config(tmp_path, kind, env, SPACE, policy=policy)
+    witness = witnessed(config, tmp_path / "run")
+    sizes = [len(selection.ids) for selection in witness.selections]
+    assert sizes[-1] > 1  # something was decided
+    replay(config, witness, CurriculumCallback(**SPACE, round_steps=STEPS))
+
+
+CURRICULA: dict[str, dict[str, Any]] = {
+    "cspace": {"eta": 0.4}, "round_robin": {}, "fixed": {"count": 2}, "random_growth": {"eta": 0.4}, "uniform": {},
+    "spdrl": {"warm_up": 1, "offset": 2}, "alp_gmm": {"fit_rate": 10, "components": 3},
+    "alp_gmm over bounds": {"fit_rate": 10, "components": 3, "over": "bounds"}, "plr": {},
+    "learnability": {"top": 2, "every": 2}, "space with zero": {"eta": 0.4, "v0": "zero", "kappa": 2},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CURRICULA)
+def test_every_curriculums_decisions_are_our_loops(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"kind": name.split()[0], **CURRICULA[name]}
+    env = {"id": PARTS, "kwargs": {"discrete": True}}
+    config = run_config(tmp_path, "ppo", env, settings, policy="MultiInputPolicy")
+    witness = witnessed(config, tmp_path / "run")
+    callback = CurriculumCallback(**settings)
+    if settings["kind"] == "learnability":  # they act with other random numbers: the same evidence is what counts
+        assert witness.probed
+
+        def probed(session: Any, seen: Any) -> list[Outcomes]:  # noqa: ARG001
+            return witness.probed.get(session.state.version, [])
+
+        monkeypatch.setattr("space_dist.sb3.callback._Session._probed", probed)
+    replay(config, witness, callback)
+    assert callback.selection.version >= 3
+
+
+def test_the_ensembles_decisions_are_our_loops(tmp_path: Path) -> None:
+    settings = {"kind": "vds", "n_batches": 2}
+    config = run_config(tmp_path, "ppo", {"id": DISCRETE}, settings, gamma=0.9)
+    witness = witnessed(config, tmp_path / "run")
+    callback = CurriculumCallback(**settings)
+    replay(config, witness, callback)
+    assert callback.numbers["largest_disagreement"] == pytest.approx(
+        witness.decisions[-1].numbers["largest_disagreement"]
+    )
+
+
+# ---- going on ----
+
+
+def line_env(env_id: str = LINE, n_envs: int = SLOTS) -> ContextVecEnv:
+    return ContextVecEnv(env_id, TARGETS, n_envs)
+
+
+def ppo(env: Any, **settings: Any) -> PPO:
+    return PPO("MlpPolicy", env, n_steps=10, batch_size=20, n_epochs=2, seed=1, device="cpu", **settings)
+
+
+MODELS: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    "ppo": (PPO, LINE, {"n_steps": 10, "batch_size": 20, "n_epochs": 2}),
+    "a2c": (A2C, LINE, {"n_steps": 5}),
+    "trpo": (TRPO, LINE, {"n_steps": 10, "batch_size": 20}),
+    "dqn": (DQN, DISCRETE, {"learning_starts": 20, "target_update_interval": 30, "train_freq": 4}),
+    "sac": (SAC, LINE, {"learning_starts": 20, "batch_size": 16}),
+    "td3": (TD3, LINE, {"learning_starts": 20, "batch_size": 16}),
+}
+
+
+def made(kind: str, **settings: Any) -> Any:
+    algorithm, env_id, given = MODELS[kind]
+    return algorithm("MlpPolicy", line_env(env_id), seed=1, device="cpu", **given, **settings)
+
+
+def same_models(one: Any, other: Any) -> None:
+    """Weights, steps, and what both remember, which holds the curriculum, the episodes and the random generators."""
+    weights, others = one.policy.state_dict(), other.policy.state_dict()
+    assert all(torch.equal(weights[name], others[name]) for name in weights)
+    assert one.num_timesteps == other.num_timesteps
+    assert getattr(one, STATE) == getattr(other, STATE)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_run_that_goes_on_is_the_run_left_alone(kind: str, tmp_path: Path) -> None:
+    settings = {**SPACE, "round_steps": 40}
+    left_alone, callback = made(kind), CurriculumCallback(**settings)
+    left_alone.learn(110, callback=callback)  # rounds end with it, episodes don't
+    assert unfinished_lengths(left_alone)
+    left_alone.save(tmp_path / "m")
+    if isinstance(left_alone, OffPolicyAlgorithm):
+        left_alone.save_replay_buffer(tmp_path / "buffer")
+    left_alone.learn(150, callback=callback, reset_num_timesteps=False)
+
+    torch.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002
+    model = MODELS[kind][0].load(tmp_path / "m", env=line_env(MODELS[kind][1]), device="cpu")
+    if isinstance(model, OffPolicyAlgorithm):
+        model.load_replay_buffer(tmp_path / "buffer")
+    again = CurriculumCallback(**settings)
+    model.learn(150, callback=again, reset_num_timesteps=False)
+    same_models(model, left_alone)
+    same_selection(again.selection, callback.selection)
+    assert again.selection.version > 1
+
+
+def remembered(model: Any) -> Checkpoint:
+    return decode_checkpoint(base64.b64decode(getattr(model, STATE)))
+
+
+def unfinished_lengths(model: Any) -> list[int]:
+    return [int(length) for length in remembered(model).arrays["unfinished/lengths"].ravel() if length]
+
+
+@pytest.mark.parametrize("settings", [SPACE, {"kind": "plr"}, {"kind": "vds"}, {"kind": "spdrl", "warm_up": 1}])
+def test_sb3s_own_checkpoints_hold_the_curriculum_wherever_they_were_made(
+    settings: dict[str, Any], tmp_path: Path
+) -> None:
+    """PPO's, in the midst of a rollout, which is collected again."""
+    total = 240
+    alone, callback = ppo(line_env()), CurriculumCallback(**settings)
+    alone.learn(total, callback=CallbackList([callback, CheckpointCallback(7, str(tmp_path), name_prefix="m")]))
+    files = sorted(tmp_path.glob("m_*.zip"), key=lambda path: int(path.stem.split("_")[1]))
+    assert len(files) == total // (7 * SLOTS)
+    for file in files[1::3]:
+        model = PPO.load(file, env=line_env(), device="cpu")
+        assert model.num_timesteps % (10 * SLOTS)  # not where a rollout ends
+        again = CurriculumCallback(**settings)
+        model.learn(total - model.num_timesteps, callback=again, reset_num_timesteps=False)
+        same_models(model, alone)
+        same_selection(again.selection, callback.selection)
+
+
+def test_an_off_policy_model_saved_in_the_midst_goes_on_with_its_curriculum(tmp_path: Path) -> None:
+    callback = CurriculumCallback(**SPACE, round_steps=40)
+    model = made("dqn")
+    model.learn(200, callback=[callback, CheckpointCallback(39, str(tmp_path), name_prefix="m")])
+    loaded = DQN.load(tmp_path / "m_156_steps.zip", env=line_env(DISCRETE), device="cpu")
+    again, round_ = CurriculumCallback(**SPACE, round_steps=40), remembered(loaded).round
+    loaded.learn(1, callback=again, reset_num_timesteps=False)
+    assert remembered(loaded).round == round_ + 2  # the one that it was in is not played a second time
+    assert loaded.num_timesteps > 156
+    assert again.selection.version >= 3
+
+
+@pytest.mark.parametrize("settings", [SPACE, {"kind": "plr"}])
+def test_what_was_broken_off_is_begun_again(settings: dict[str, Any]) -> None:
+    driven = []
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            driven.append(self.training_env.driven)
+            return self.n_calls != 15
+
+    model, callback = ppo(line_env()), CurriculumCallback(**settings)
+    model.learn(200, callback=[callback, Stop()])
+    assert model.num_timesteps == 15 * SLOTS
+    assert remembered(model).data["run"]["steps"] == 10 * SLOTS
+    version = callback.selection.version
+    model.learn(80, callback=[callback, Stop()], reset_num_timesteps=False)  # stopped once more
+    model.learn(80, callback=[callback, Stop()], reset_num_timesteps=False)
+    assert callback.selection.version > version
+    assert all(driven)  # every step was one of the curriculum's own
+    model.learn(40, callback=callback)  # SB3 begins to count anew, and the curriculum goes on
+    assert model.num_timesteps == 40
+    assert callback.selection.version > version + 1
+
+
+def test_without_gradient_steps_nothing_counts_as_settled() -> None:
+    model, callback = made("dqn"), CurriculumCallback("space", round_steps=16)
+    model.learn(96, callback=callback)
+    tests, version = callback.numbers["tests"], callback.selection.version
+    assert tests > 0
+    model.gradient_steps = 0
+    model.learn(96, callback=callback, reset_num_timesteps=False)  # ends the iteration that had some
+    assert callback.numbers["tests"] <= tests + 1
+    tests, version = callback.numbers["tests"], callback.selection.version
+    model.learn(96, callback=callback, reset_num_timesteps=False)
+    assert callback.selection.version > version
+    assert callback.numbers["tests"] == tests
+
+
+def test_another_curriculum_than_the_model_remembers_is_refused(tmp_path: Path) -> None:
+    model = ppo(line_env())
+    model.learn(80, callback=CurriculumCallback("space", eta=0.4))
+    model.save(tmp_path / "m")
+
+    def loaded(targets: Any = TARGETS) -> PPO:
+        return PPO.load(tmp_path / "m", env=ContextVecEnv(LINE, targets, SLOTS), device="cpu")
+
+    with pytest.raises(ConfigError, match=r"another curriculum: curriculum\.eta was 0\.4 and is 0\.2.*resume=False"):
+        loaded().learn(40, callback=CurriculumCallback("space", eta=0.2))
+    with pytest.raises(ConfigError, match=r"curriculum\.kind was space and is uniform"):
+        loaded().learn(40, callback=CurriculumCallback("uniform"))
+    with pytest.raises(ConfigError, match="instances was"):
+        loaded(TARGETS[:-1]).learn(40, callback=CurriculumCallback("space", eta=0.4))
+    anew = CurriculumCallback("uniform", resume=False)
+    loaded().learn(40, callback=anew)
+    assert anew.selection.version == 1
+    fewer = PPO.load(tmp_path / "m", env=line_env(n_envs=2), device="cpu")
+    fewer.learn(40, callback=CurriculumCallback("space", eta=0.4), reset_num_timesteps=False)  # other slots begin anew
+
+
+def test_what_cannot_be_read_is_refused_in_a_sentence() -> None:
+    model = ppo(line_env())
+    model.learn(80, callback=CurriculumCallback(**SPACE))
+    text = getattr(model, STATE)
+    content = base64.b64decode(text)
+    damaged = bytearray(content)
+    damaged[len(content) // 2] ^= 1
+    for wrong in (
+        7,
+        "",
+        "?",
+        text[:100],
+        base64.b64encode(bytes(damaged)).decode(),
+        base64.b64encode(b"pickle").decode(),
+    ):
+        again = ppo(line_env())
+        setattr(again, STATE, wrong)
+        with pytest.raises(SpaceDistError, match=r"cannot be read \(.*resume=False"):
+            again.learn(40, callback=CurriculumCallback(**SPACE))
+
+
+# ---- what a model's values are ----
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda env: QRDQN("MlpPolicy", env, device="cpu"), lambda p, o: p.quantile_net(o).mean(1).max(1).values),
+        (lambda env: DQN("MlpPolicy", env, device="cpu"), lambda p, o: p.q_net(o).max(1).values),
+        (lambda env: MaskablePPO("MlpPolicy", env, device="cpu"), lambda p, o: p.predict_values(o)[:, 0]),
+    ],
+)
+def test_values_of_models_with_discrete_actions(make: Callable[..., Any], expected: Callable[..., Any]) -> None:
+    env = line_env(DISCRETE)
+    model, observations = make(env), np.random.default_rng(0).uniform(-1, 1, (5, 2)).astype(np.float32)
+    found = Scored(model, Wrapped(env)).values(observations)
+    with torch.no_grad():
+        assert found.tolist() == expected(model.policy, torch.as_tensor(observations)).double().tolist()
+
+
+def test_values_of_models_with_continuous_actions() -> None:
+    env, observations = line_env(), np.random.default_rng(0).uniform(-1, 1, (5, 2)).astype(np.float32)
+    inputs = torch.as_tensor(observations)
+    for algorithm in (SAC, TD3, TQC, CrossQ):
+        model = algorithm("MlpPolicy", env, device="cpu")
+        found = Scored(model, Wrapped(env)).values(observations)
+        actions, _ = model.predict(observations, deterministic=True)  # the line's actions are scaled already
+        with torch.no_grad():
+            critics = model.critic(inputs, torch.as_tensor(actions))
+            expected = critics.mean((1, 2)) if algorithm is TQC else torch.minimum(*critics)[:, 0]
+        np.testing.assert_allclose(found, expected.numpy(), rtol=1e-5, atol=1e-6)
+
+
+def test_a_recurrent_policy_has_the_value_of_one_that_remembers_nothing() -> None:
+    env = line_env()
+    model = RecurrentPPO("MlpLstmPolicy", env, n_steps=10, batch_size=20, seed=0, device="cpu")
+    callback = CurriculumCallback(**SPACE)
+    model.learn(80, callback=callback)
+    observations = env.reset()
+    states = tuple(torch.zeros(1, SLOTS, 256) for _ in range(2))
+    with torch.no_grad():
+        expected = model.policy.predict_values(torch.as_tensor(observations), states, torch.ones(SLOTS))[:, 0]
+    assert Scored(model, Wrapped(env)).values(observations).tolist() == expected.double().tolist()
+    assert callback.selection.version > 0
+
+
+def test_a_change_of_scale_is_no_progress() -> None:
+    """With nothing learnt, values of new scales equal those of old weights under new scales."""
+    env = VecNormalize(line_env(), gamma=0.9)
+    model, callback = ppo(env, learning_rate=0.0, gamma=0.9), CurriculumCallback("space")
+    model.learn(120, callback=callback)
+    assert callback.numbers["largest_pic"] == callback.numbers["smallest_pic"] == 0.0
+    raw = env.venv.reset()
+    with torch.no_grad():
+        inputs = torch.as_tensor(np.asarray(env.normalize_obs(raw)))
+        scaled = model.policy.predict_values(inputs)[:, 0].double().numpy()
+    found = Scored(model, Wrapped(env)).values(raw)
+    np.testing.assert_allclose(found, scaled * np.sqrt(env.ret_rms.var + env.epsilon), rtol=1e-6)
+
+
+# ---- the environment ----
+
+
+class Lesson(Honest):
+    """With something of its own to tell."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, {**info, "own": 1}
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        return np.array([True, False, True])
+
+
+CONTEXTS = np.array([[0.2, 0.1], [0.3, -0.2], [0.4, 0.3]])
+
+
+def test_without_a_callback_it_walks_over_its_instances() -> None:
+    env = ContextVecEnv(Lesson, CONTEXTS)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    instances: list[int] = []
+
+    def note(locals_: dict[str, Any], _: dict[str, Any]) -> None:
+        if locals_["done"]:
+            info = locals_["info"]
+            instances.append(info["instance"])
+            assert info["context"].tolist() == CONTEXTS[info["instance"]].tolist()
+            assert {"own", "is_success", "terminal_observation", "TimeLimit.truncated"} <= info.keys()
+
+    played = [evaluate_policy(model, env, n_eval_episodes=3, callback=note, return_episode_rewards=True, warn=True)
+              for _ in range(2)]  # fmt: skip
+    assert instances == [0, 1, 2] * 2
+    assert played[0] == played[1]
+    single = Lesson()
+    for number, (reward, length) in enumerate(zip(*played[0], strict=True)):
+        assert length >= 1
+        assert np.isfinite(reward)
+        assert single.context_space.contains(CONTEXTS[number].astype(single.context_space.dtype))
+
+
+def test_it_answers_as_sb3s_own_does() -> None:
+    """Step by step, beside DummyVecEnv's environments that are reset by hand."""
+    env = ContextVecEnv(Lesson, CONTEXTS, 2, context_visible=False, seed=9)
+    other = make_vec_env(Lesson, 2)
+    assert env.observation_space == other.observation_space
+    assert env.action_space == other.action_space
+    observations = env.reset()
+    assert observations.shape == other.reset().shape
+    random = np.random.default_rng(0)
+    finished = 0
+    for _ in range(60):
+        observations, rewards, dones, infos = env.step(random.integers(3, size=2))
+        assert (observations.dtype, rewards.dtype, dones.dtype) == (np.float32, np.float32, np.bool_)
+        for slot in np.flatnonzero(dones):
+            finished += 1
+            assert infos[slot]["terminal_observation"].shape == observations[slot].shape
+            assert infos[slot]["episode"]["l"] >= 1
+    assert finished > 4
+    assert env.get_attr("context_names") == [("gain", "drift")] * 2
+    assert np.array(env.env_method("action_masks", indices=[1])).tolist() == [[True, False, True]]
+    assert env.env_is_wrapped(Monitor) == [True, True]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
+    env.set_attr("own", 3, indices=0)
+    assert env.get_attr("own", indices=0) == [3]
+    assert not env.has_attr("nothing")
+    env.close()
+
+
+def test_it_walks_on_for_as_long_as_it_is_stepped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("space_dist.sb3.vec_env._FREE_STEPS", 5)
+    env = line_env(n_envs=2)
+    met = []
+    for _ in range(40):  # before any reset, and beyond what is remembered at once
+        _, _, _, infos = env.step(np.zeros((2, 1), dtype=np.float32))
+        met += [info["instance"] for info in infos if "instance" in info]
+    assert met == [number % len(TARGETS) for number in range(len(met))]
+    assert len(met) == 10
+
+
+def test_masked_policies_learn() -> None:
+    env = ContextVecEnv(Lesson, CONTEXTS, 2)
+    model = MaskablePPO("MlpPolicy", env, n_steps=16, batch_size=16, seed=0, device="cpu")
+    callback = CurriculumCallback("plr")
+    model.learn(96, callback=callback)
+    assert callback.selection.version == 3
+    assert (model.rollout_buffer.actions != 1).all()
+
+
+def test_probe_episodes_are_counted() -> None:
+    env = ContextVecEnv(DISCRETE, TARGETS, SLOTS)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=20, n_epochs=1, seed=0, device="cpu")
+    callback = CurriculumCallback("learnability", top=2, every=2, episodes=2)
+    seen: list[Mapping[str, Any]] = []
+
+    class Note(BaseCallback):
+        def _on_step(self) -> bool:
+            if not seen or seen[-1] is not callback.numbers:
+                seen.append(callback.numbers)
+            return True
+
+    model.learn(1000, callback=[callback, Note()])
+    probes = sum(numbers.get("probe_steps", 0) for numbers in seen)
+    assert probes > 0
+    assert probes % (2 * len(TARGETS) * 8) == 0  # whole episodes, of eight steps, two of every instance
+    rounds = remembered(model).round
+    assert model.num_timesteps == rounds * 10 * SLOTS + probes
+    assert model.num_timesteps <= 1000 + 10 * SLOTS
+
+
+# ---- what is refused ----
+
+
+@pytest.mark.parametrize(
+    ("attempt", "sentence"),
+    [
+        (lambda: CurriculumCallback("spacey"), r"CurriculumCallback: curriculum\.kind: 'spacey' is not known; did you "
+                                               r"mean 'space'\?"),
+        (lambda: CurriculumCallback("space", kapa=2), r"curriculum\.kapa: unknown key; did you mean 'kappa'\?"),
+        (lambda: CurriculumCallback("space", eta=-1.0), r"curriculum\.eta: -1\.0: .*greater than 0"),
+        (lambda: CurriculumCallback("space", passes=0.0), "passes: 0.0: .*greater than 0"),
+        (lambda: CurriculumCallback().selection, r"before learn\(\) has begun"),
+        (lambda: ContextVecEnv(Honest(), CONTEXTS), "env is a Honest; give the class"),
+        (lambda: ContextVecEnv(Honest, CONTEXTS, 0), "n_envs must be a whole number of at least 1, not 0"),
+        (lambda: ContextVecEnv(Honest, CONTEXTS[:, 0]), r"shape \(3,\); it needs one row an instance and 2 columns, "
+                                                        "one for each of gain, drift"),
+        (lambda: ContextVecEnv(Honest, [["a", "b"]]), "instances is a list; give a CSV file"),
+        (lambda: ContextVecEnv(Honest, CONTEXTS + 1.0), r"instance 0 has gain = 1\.2, outside .* \[0\.1, 0\.5\]"),
+        (lambda: ContextVecEnv(Honest, "nowhere.csv"), "nowhere.csv: there is no such file"),
+        (lambda: ContextVecEnv(LINE, InstanceSet(np.array([0]), np.array([[0.1]]), ("goal",))),
+         "features are goal, the environment's are target"),
+        (lambda: ContextVecEnv("CartPole-v1", [0.5]), "CartPole-v1.*no `context_space`"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> None:
+    with pytest.raises(SpaceDistError, match=sentence):
+        attempt()
+
+
+@pytest.mark.parametrize(
+    ("model", "callback", "sentence"),
+    [
+        (lambda: PPO("MlpPolicy", make_vec_env(Honest, 2), n_steps=8, batch_size=8), {}, "a DummyVecEnv, which"),
+        (lambda: PPO("MlpPolicy", VecFrameStack(line_env(), 2), n_steps=8, batch_size=8), {}, "VecFrameStack around"),
+        (lambda: ARS("MlpPolicy", line_env()), {}, "ARS has no value function"),
+        (lambda: made("dqn"), {"kind": "plr"}, "plr scores episodes by their advantages, which DQN does not compute"),
+        (lambda: MaskablePPO("MlpPolicy", line_env(DISCRETE)), {"kind": "learnability", "top": 2},
+         "MaskablePPO could not"),
+        (lambda: ppo(line_env()), {"kind": "learnability"}, r"curriculum\.top: 20 is too many"),
+        (lambda: ppo(ContextVecEnv(LINE, TARGETS, SLOTS, context_visible=False)), {}, "context_visible=True"),
+        (lambda: ppo(line_env(), policy_kwargs={"activation_fn": torch.nn.ELU}), {"kind": "vds"},
+         "knows Tanh and ReLU, not ELU"),
+        (lambda: ppo(line_env()), {"aggregate": "population"}, "trains several policies"),
+        (lambda: ppo(line_env()), {"kind": "manual", "column": "difficulty"}, "without a column 'difficulty'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_given_is_refused(model: Callable[[], Any], callback: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        model().learn(16, callback=CurriculumCallback(**callback))
+
+
+# ---- the examples ----
+
+
+def examples() -> dict[str, str]:
+    """By name, what changes in each."""
+    return {
+        plain: "".join(
+            difflib.unified_diff(
+                (EXAMPLES / f"{plain}.py").read_text().splitlines(keepends=True),
+                (EXAMPLES / f"{plain}_space.py").read_text().splitlines(keepends=True),
+                n=1,
+            )
+        )
+        for plain in ("ppo_lander", "dqn_cartpole")
+    }
+
+
+def test_the_examples_are_a_few_lines_apart_and_shown_as_they_are() -> None:
+    shown = re.findall(r"```diff\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
+    for diff, block in zip(examples().values(), shown, strict=True):
+        body = "".join(diff.splitlines(keepends=True)[2:])
+        assert body == block
+        assert 0 < len(re.findall(r"^[+-]", body, flags=re.MULTILINE)) <= 10
+    (lander,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "your_environment.md").read_text(), flags=re.DOTALL)
+    assert (EXAMPLES / "my_lander.py").read_text() == lander
+
+
+@pytest.mark.parametrize("name", ["ppo_lander", "ppo_lander_space", "dqn_cartpole", "dqn_cartpole_space"])
+def test_the_examples_run_and_import_neither_ray_nor_mlflow(name: str, tmp_path: Path) -> None:
+    program = (
+        "import json, runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__'); "
+        "print(json.dumps([name for name in ('ray', 'mlflow', 'space_dist.learner') if name in sys.modules]))"
+    )
+    environment = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    environment["PYTHONPATH"] = f"{EXAMPLES}{os.pathsep}{ROOT}"
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(EXAMPLES / f"{name}.py"), "4096"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=PATIENCE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == []
+    assert ("curriculum/" in done.stdout) == name.endswith("_space")
+    assert len(list(tmp_path.glob("*.zip"))) == 1
+
+
+def test_a_script_computes_as_it_did() -> None:
+    """Settings for the same bits everywhere would have its matrix products take several times as long."""
+    program = "import os, stable_baselines3, space_dist.sb3; print(sorted(os.environ))"
+    environment = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not set(SETTINGS).intersection(ast.literal_eval(done.stdout))
+
+
+def test_the_document_is_linked() -> None:
+    assert "(docs/sb3.md)" in (ROOT / "README.md").read_text()
+    for target in re.findall(r"\]\((?!http)([^)#]+)\)", DOCUMENT.read_text()):
+        assert (DOCUMENT.parent / target).exists(), target
+
+
+def test_spaces_of_parts_are_seen() -> None:
+    env = ContextVecEnv(PARTS, TARGETS, 2)
+    assert isinstance(env.observation_space, spaces.Dict)
+    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    callback = CurriculumCallback("space", eta=0.9)
+    model.learn(64, callback=callback)
+    assert callback.selection.version > 0
