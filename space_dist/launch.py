@@ -239,8 +239,8 @@ def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
 
 def _also_decide(config: RunConfig) -> list[str]:
     """The distributions whose arithmetic this run uses, besides those that every run does."""
-    ppo = isinstance(config.learner, PPOConfig)
-    compiled = ppo and (config.engine == "population" or getattr(config.learner, "update", "") == "lean")
+    together = isinstance(config.learner, PPOConfig) and config.engine == "population"
+    compiled = together or getattr(config.learner, "update", "stock") == "lean"
     also = {
         "scikit-learn": config.curriculum.kind == "alp_gmm",
         "pybullet": config.env.id in BULLET_IDS,
