@@ -192,7 +192,11 @@ def learnt_from_samples(algorithm: Any, random: np.random.Generator) -> bytes:
         sac.prepare(np.dtype("f4"))(
             *arguments, sac.Settings(*adam, 0, 0, 1, 0.05, True, 0.0, -3.0), *samples, *noises, 50, told
         )
-    everything = m[: layout.plan.targets + layout.plan.length]
+    length = layout.plan.length
+    everything = m[: layout.plan.targets + length]
+    unused = np.ones(length, dtype=np.bool_)  # what is too much is zero, and stays it
+    unused[np.concatenate([places for places in layout.places.values() if places[0] < length])] = False
+    assert not everything.reshape(5, length)[:, unused].any()
     assert np.isfinite(everything).all()
     assert np.isfinite(told).all()
     return everything.tobytes() + told.tobytes()

@@ -13,13 +13,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist import config as configs
+from space_dist import learner as learners
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.learner import lean_replay, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
-from space_dist.training import Progress
+from space_dist.training import Progress, resolved
 from tests.test_lean import Casting, close
 from tests.test_off_policy import CONFIGS, KINDS, ROUND, SEED, STEPS, Stream, action_space, learn, rounds_of, stream_for
 
@@ -357,3 +358,26 @@ def test_the_update_is_part_of_what_a_run_is_and_stock_changes_no_identity() -> 
         for overrides in ([], ["learner.update=stock"], ["learner.update=lean"])
     )
     assert plain == stock != ours
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numba_that_may_not_compile_is_told(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learners, "COMPILES", False)
+    stock, ours = (
+        configs.load(CARTPOLE, [f"learner={{kind: {kind}, update: {update}}}"]) for update in ("stock", "lean")
+    )
+    learners.refuse_machine(stock)
+    with pytest.raises(ConfigError, match=r"NUMBA_DISABLE_JIT is set .* the update of learner\.update: lean is a comp"):
+        learners.refuse_machine(ours)
+
+
+def test_there_is_no_population_of_it() -> None:
+    config = configs.load(CARTPOLE, ["learner.update=lean", "engine=auto"])
+    assert resolved(config).engine == "single"
+    with pytest.raises(ConfigError, match=r"engine: population learns with learner\.kind: ppo or trpo, not dqn"):
+        learners.refuse_population(config.learner, spaces.Box(-1.0, 1.0, (3,)), spaces.Discrete(2))
+
+
+def test_what_compiled_it_is_part_of_what_a_run_is_compared_by(tmp_path: Path) -> None:
+    launch(run_config("dqn", tmp_path), tmp_path / "run", resume=False, stop=StopRequests())
+    assert {"numba", "llvmlite"} <= set(Ledger(tmp_path / "run").status().fingerprint)
