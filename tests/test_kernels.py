@@ -202,6 +202,24 @@ def learnt_from_samples(algorithm: Any, random: np.random.Generator) -> bytes:
     return everything.tobytes() + told.tobytes()
 
 
+def test_what_optimisers_remember_of_dead_units_vanishes_at_once() -> None:
+    """Numbers below the normal ones take many times as long, and would stay: 0.9 of the least rounds to the least."""
+    layout = ReplayLayout.of(ReplayShape("dqn", 7, 3, (40,), "relu"), 16, 4)
+    m, length, random = aligned(layout.size, np.float32), layout.plan.length, np.random.default_rng(0)
+    weights, biases = (layout.places[f"q_net.q_net.0.{name}"] for name in ("weight", "bias"))
+    m[weights], m[biases] = random.normal(size=(2, 280))[0], -100.0  # nothing is ever active
+    m[2 * length + weights], m[3 * length + weights] = 1e-37, 2e-38
+    before, told = m[weights].copy(), np.zeros((60, dqn.TOLD))
+    samples = [random.normal(size=(60 * 16, columns)).astype("f4") for columns in (7, 7, 1, 1, 1)]
+    samples[2] = random.integers(0, 3, size=(60 * 16, 1)).astype("f4")
+    settings = dqn.Settings(1e-3, 0.9, 0.99, 1e-8, 1000, 10.0)
+    dqn.prepare(np.dtype("f4"))(m, layout.plan, layout.layers, settings, *samples, 16, told)
+    np.testing.assert_array_equal(m[weights], before)
+    assert not m[2 * length + weights].any()
+    assert not m[3 * length + weights].any()
+    assert m[2 * length + layout.places["q_net.q_net.2.bias"]].all()
+
+
 def test_another_cpus_code_has_the_same_bits(tmp_path: Path) -> None:
     """Without AVX and FMA: vectors of four, and the C library's `fmaf`, which rounds once as well."""
     code = "from tests.test_kernels import learnt; print(learnt())"

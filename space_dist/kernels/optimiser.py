@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from space_dist.kernels.lanes import compiled, every, fma, function, load, root, store, total, width
+from space_dist.kernels.lanes import compiled, every, fma, function, load, root, store, total, where_greater, width
+
+# What moves no weight: float32's least normal number. Below it arithmetic takes many times as long.
+_LEAST = 2.0**-126
 
 
 @function
@@ -41,6 +44,14 @@ def _power(base: float, exponent: int) -> float:
     return found
 
 
+@compiled
+def _if_any(average: Any) -> Any:
+    """An average, or 0 for one that has all but vanished, as those of units that are never active do."""
+    zero = every(average, 0.0)
+    size = where_greater(zero, average, zero - average, average)
+    return where_greater(every(average, _LEAST), size, zero, average)
+
+
 @function
 def adam(m: Any, length: int, first: int, last: int, settings: Any, step: int, factor: float) -> None:
     """Adam's step number `step` (from 1) of the parameters from `first` to `last`, with `factor` times their gradient.
@@ -60,6 +71,7 @@ def adam(m: Any, length: int, first: int, last: int, settings: Any, step: int, f
         mean, square = load(m, 2 * length + at), load(m, 3 * length + at)
         mean = fma(gradient - mean, mean_share, mean)
         square = fma(gradient * square_share, gradient, square * kept)
+        mean, square = _if_any(mean), _if_any(square)
         store(m, 2 * length + at, mean)
         store(m, 3 * length + at, square)
         store(m, at, fma(mean / fma(root(square), unbiased, eps), rate, load(m, at)))

@@ -88,6 +88,7 @@ def _limited(log_std: Any) -> Any:
 
 @function
 def _goals(m: Any, plan: Any, layers: Any, alpha: Any) -> None:
+    """What the lower target critic promises of the actor's next actions, and their bonus for uncertainty."""
     rows, lanes = plan.rows, width(m)
     for row in range(0, rows, lanes):
         bonus = alpha * load(m, plan.log_probs_at + row)

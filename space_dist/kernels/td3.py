@@ -49,7 +49,7 @@ class Settings(NamedTuple):
 
 @function
 def _goals(m: Any, plan: Any, layers: Any) -> None:
-    """What the target actor's actions, and their noise, promise; the critics' inputs hold what was observed."""
+    """What the lower target critic promises of the target actor's actions."""
     rows, lanes = plan.rows, width(m)
     for row in range(0, rows, lanes):
         set_goals(m, plan, row, lower_targets(m, plan, layers, row))

@@ -50,7 +50,7 @@ class Networks:
         """The array of a layout, with everything in it."""
         layout = self.layout(size)
         m, length = aligned(layout.size, self.dtype), layout.plan.length
-        m[_places(layout, self._named)] = joined(list(self._named.values()))
+        m[_places(layout, list(self._named))] = joined(list(self._named.values()))
         for optimizer, names in zip(self._optimizers, self._optimised, strict=True):
             if optimizer.state:
                 states = [optimizer.state[self._named[name]] for name in names]
@@ -95,7 +95,7 @@ def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
-def _places(layout: ReplayLayout, names: Sequence[str] | dict[str, Any]) -> NDArray[np.int64]:
+def _places(layout: ReplayLayout, names: Sequence[str]) -> NDArray[np.int64]:
     return np.concatenate([layout.places[name] for name in names])
 
 
