@@ -16,6 +16,7 @@ from benchmarks import (
     equivalence,
     grid,
     kernel,
+    off_policy,
     pic,
     throughput,
 )
@@ -35,6 +36,7 @@ for _benchmark in (
     equivalence.equivalence,
     grid.grid,
     kernel.kernel,
+    off_policy.off_policy,
     pic.pic,
     throughput.throughput,
 ):

@@ -559,6 +559,12 @@ class _Learner(Section):
         """Whether its updates are a compiled function of ours with this engine, where they are computed on a CPU."""
         return False
 
+    @model_validator(mode="after")
+    def _lean_knows_mlps_only(self) -> Self:
+        if getattr(self, "update", "stock") == "lean" and self.policy != "MlpPolicy":
+            raise ValueError(f"update: lean knows MlpPolicy only, not {self.policy}; allowed with it: stock")
+        return self
+
 
 class _OnPolicy(_Learner):
     has_advantages: ClassVar[bool] = True
@@ -606,12 +612,6 @@ class PPOConfig(_OnPolicy):
     """stock: SB3's own train(). lean: the same minibatches, loss and optimiser in one compiled function, many times
     faster where networks are small, equal but for rounding, and with the same bits on every CPU; MlpPolicy only. Part
     of what a run is."""
-
-    @model_validator(mode="after")
-    def _lean_knows_mlps_only(self) -> Self:
-        if self.update == "lean" and self.policy != "MlpPolicy":
-            raise ValueError(f"update: lean knows MlpPolicy only, not {self.policy}; allowed with it: stock")
-        return self
 
     def is_compiled(self, engine: str) -> bool:
         """See `_Learner`."""
@@ -685,11 +685,19 @@ class _OffPolicy(_Learner):
     """Gradient steps per environment step. Source: SB3's SAC and TD3 (1); its DQN makes 1 every 4 steps (0.25)."""
     tau: float = Field(default=0.005, gt=0.0, le=1.0)
     """Share of the online network that enters the target network per update. Source: SB3's SAC and TD3."""
+    update: Literal["stock", "lean"] = "stock"
+    """stock: SB3's own train(). lean: the same minibatches, losses and optimisers in one compiled function, several
+    times faster where networks are small, equal but for rounding, and with the same bits on every CPU; MlpPolicy only.
+    Part of what a run is."""
 
     @property
     def episodes_per_round(self) -> int | None:
         """See `_Learner`."""
         return self.n_episodes
+
+    def is_compiled(self, engine: str) -> bool:  # noqa: ARG002 - there are no populations of these
+        """See `_Learner`."""
+        return self.update == "lean"
 
 
 class DQNConfig(_OffPolicy):

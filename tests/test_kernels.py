@@ -17,7 +17,8 @@ import pytest
 from numba.core import types
 from numpy.typing import NDArray
 
-from space_dist.kernels import Layout, Settings, Shape, aligned, build, functions, lanes, prepare
+from space_dist.kernels import Layout, Settings, Shape, aligned, build, dqn, functions, lanes, prepare, sac, td3
+from space_dist.kernels.replay import ReplayLayout, ReplayShape
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -52,7 +53,7 @@ def bits_between(low: float, high: float, step: int) -> NDArray[np.float32]:
 
 SINGLE: dict[str, tuple[Any, Any, float, list[NDArray[np.float32]]]] = {
     "exp": (functions.exp, np.exp, 1.0, [bits_between(1e-30, 88.722, 997), -bits_between(1e-30, 87.33, 997)]),
-    "log": (functions.log, np.log, 1.0, [bits_between(1.0, 1e38, 997)]),
+    "log": (functions.log, np.log, 1.0, [bits_between(1.2e-38, 1e38, 997), bits_between(0.4, 1.6, 3)]),
     "tanh": (functions.tanh, np.tanh, 6.0, [bits_between(1e-30, 12.0, 997), -bits_between(1e-30, 12.0, 997)]),
 }
 
@@ -67,6 +68,7 @@ def test_functions_of_float32_are_as_exact_as_their_table_says(name: str) -> Non
 DOUBLE: dict[str, tuple[Any, Any, float, float, float]] = {
     "exp": (functions.exp, mpmath.exp, 1.0, -708.0, 709.0),
     "log": (functions.log, mpmath.log, 1.0, 1.0, 1e6),
+    "log of little": (functions.log, mpmath.log, 1.0, 1e-7, 1.5),
     "tanh": (functions.tanh, mpmath.tanh, 4e-16, -20.0, 20.0),
 }
 
@@ -161,7 +163,61 @@ def learnt() -> str:
         for array in (outputs, values, log_probs, m[: layout.plan.length], told):
             assert np.isfinite(array).all()
             digest.update(array.tobytes())
+    for algorithm in ("dqn", "td3", "sac"):
+        digest.update(learnt_from_samples(algorithm, random))
     return digest.hexdigest()
+
+
+def learnt_from_samples(algorithm: Any, random: np.random.Generator) -> bytes:
+    """What three gradient steps on samples leave of an off-policy learner's networks, targets and optimisers."""
+    shape = ReplayShape(algorithm, 7, 3, (40, 19), "tanh" if algorithm == "td3" else "relu")
+    layout = ReplayLayout.of(shape, 50, 4)
+    m, actions = aligned(layout.size, np.float32), random.uniform(-1.0, 1.0, size=(150, 3)).astype("f4")
+    for places in layout.places.values():
+        m[places] = 0.3 * random.normal(size=len(places))
+    observed, following, noise, more = random.normal(size=(4, 150, 7)).astype("f4")
+    rewards, factors = random.normal(size=(2, 150, 1)).astype("f4")
+    samples = [observed, following, actions, rewards, factors]
+    if algorithm == "dqn":
+        samples[2] = random.integers(0, 3, size=(150, 1)).astype("f4")
+    told, adam = np.zeros((3, {"dqn": dqn, "td3": td3, "sac": sac}[algorithm].TOLD)), (1e-3, 0.9, 0.999, 1e-8)
+    arguments: tuple[Any, ...] = m, layout.plan, layout.layers
+    if algorithm == "dqn":
+        dqn.prepare(np.dtype("f4"))(*arguments, dqn.Settings(*adam, 0, 10.0), *samples, 50, told)
+    elif algorithm == "td3":
+        settings = td3.Settings(*adam, 0, 0, 0, 2, 0.05)
+        td3.prepare(np.dtype("f4"))(*arguments, settings, *samples, noise[:, :3].copy(), 50, told)
+    else:
+        noises = noise[:, :3].copy(), more[:, :3].copy()
+        sac.prepare(np.dtype("f4"))(
+            *arguments, sac.Settings(*adam, 0, 0, 1, 0.05, True, 0.0, -3.0), *samples, *noises, 50, told
+        )
+    length = layout.plan.length
+    everything = m[: layout.plan.targets + length]
+    unused = np.ones(length, dtype=np.bool_)  # what is too much is zero, and stays it
+    unused[np.concatenate([places for places in layout.places.values() if places[0] < length])] = False
+    assert not everything.reshape(5, length)[:, unused].any()
+    assert np.isfinite(everything).all()
+    assert np.isfinite(told).all()
+    return everything.tobytes() + told.tobytes()
+
+
+def test_what_optimisers_remember_of_dead_units_vanishes_at_once() -> None:
+    """Numbers below the normal ones take many times as long, and would stay: 0.9 of the least rounds to the least."""
+    layout = ReplayLayout.of(ReplayShape("dqn", 7, 3, (40,), "relu"), 16, 4)
+    m, length, random = aligned(layout.size, np.float32), layout.plan.length, np.random.default_rng(0)
+    weights, biases = (layout.places[f"q_net.q_net.0.{name}"] for name in ("weight", "bias"))
+    m[weights], m[biases] = random.normal(size=(2, 280))[0], -100.0  # nothing is ever active
+    m[2 * length + weights], m[3 * length + weights] = 1e-37, 2e-38
+    before, told = m[weights].copy(), np.zeros((60, dqn.TOLD))
+    samples = [random.normal(size=(60 * 16, columns)).astype("f4") for columns in (7, 7, 1, 1, 1)]
+    samples[2] = random.integers(0, 3, size=(60 * 16, 1)).astype("f4")
+    settings = dqn.Settings(1e-3, 0.9, 0.99, 1e-8, 1000, 10.0)
+    dqn.prepare(np.dtype("f4"))(m, layout.plan, layout.layers, settings, *samples, 16, told)
+    np.testing.assert_array_equal(m[weights], before)
+    assert not m[2 * length + weights].any()
+    assert not m[3 * length + weights].any()
+    assert m[2 * length + layout.places["q_net.q_net.2.bias"]].all()
 
 
 def test_another_cpus_code_has_the_same_bits(tmp_path: Path) -> None:

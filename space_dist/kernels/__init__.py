@@ -1,6 +1,7 @@
 """Compiled arithmetic with bits of its own: the same on every CPU, whatever its vectors (`lanes` says why).
 
-`ppo` is PPO's whole update of one actor-critic, and its passes forward alone; `networks` says where its numbers lie.
+`ppo` is PPO's whole update of one actor-critic, and its passes forward alone; `dqn`, `td3` and `sac` are gradient steps
+on samples of a replay buffer (`replay`). `networks` says where numbers lie.
 """
 
 from space_dist.kernels.lanes import COMPILES

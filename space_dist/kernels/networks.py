@@ -1,4 +1,4 @@
-"""An actor and a critic in one array of numbers: where everything lies, and their passes forward and backward.
+"""Networks in one array of numbers, PPO's actor and critic among them: where all lies, and passes forward and back.
 
 Hidden layers' weights, and what the units of a layer say about a minibatch, lie in *panels*: a matrix is cut into
 strips as wide as `Lanes` (L), and a strip is stored row after row. Then all three products of a layer (its sums, its
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -128,27 +129,14 @@ class Layout:
         """For minibatches of up to `rows` samples, and numbers of `itemsize` bytes."""
         lanes = BYTES // itemsize
         rows = rounded_up(rows, lanes)
-        parameters, work = _Places(), _Places()
-        hidden = list(itertools.pairwise((shape.inputs, *shape.hidden)))
-        last = shape.hidden[-1] if shape.hidden else shape.inputs
-        weights: list[list[tuple[int, int]]] = []
+        parameters, work = Places(), Places()
+        networks: list[Perceptron] = []
         places: dict[str, NDArray[np.int64]] = {}
         for name, head, outputs in (("policy", "action", shape.outputs), ("value", "value", 1)):
-            weights.append([])
-            for layer, (n_in, n_out) in enumerate(hidden):
-                below, above = rounded_up(n_in, lanes), rounded_up(n_out, lanes)
-                at = parameters.take(below * above)
-                units, inputs = np.arange(n_out)[:, None], np.arange(n_in)
-                place = at + (units // lanes * below + inputs) * lanes + units % lanes
-                bias = parameters.take(above)
-                weights[-1].append((at, bias))
-                stem = f"mlp_extractor.{name}_net.{2 * layer}"
-                places |= {f"{stem}.weight": place.ravel(), f"{stem}.bias": bias + np.arange(n_out)}
-            below = rounded_up(last, lanes)
-            at, bias = parameters.take(outputs * below), parameters.take(rounded_up(outputs, lanes))
-            weights[-1].append((at, bias))
-            place = at + np.arange(outputs)[:, None] * below + np.arange(last)
-            places |= {f"{head}_net.weight": place.ravel(), f"{head}_net.bias": bias + np.arange(outputs)}
+            network = Perceptron.of((shape.inputs, *shape.hidden, outputs), lanes, parameters)
+            networks.append(network)
+            stems = [f"mlp_extractor.{name}_net.{2 * layer}" for layer in range(len(shape.hidden))]
+            places |= network.named((*((stem,) for stem in stems), (f"{head}_net",)))
         log_std_at = parameters.take(rounded_up(shape.outputs, lanes))
         if not shape.discrete:
             places["log_std"] = log_std_at + np.arange(shape.outputs)
@@ -159,20 +147,11 @@ class Layout:
         zeros_at = work.take(lanes)
         inputs_at = work.take(rows * rounded_up(shape.inputs, lanes))
         fields_at, shares_at = work.take(fields * rows), work.take(rows)
-        widest = [rounded_up(n, lanes) for n in shape.hidden]
-        turned_at = work.take(max((a * b for a, b in itertools.pairwise(widest)), default=0))
+        turned_at = work.take(most_weights(shape.hidden, lanes))
         sums_at, block_at = work.take(GROUP * rows * lanes), work.take(2 * lanes * lanes)
-        layers = np.zeros((2, len(hidden) + 1, len(Layer._fields)), dtype=np.int64)
-        for network, outputs in ((ACTOR, shape.outputs), (CRITIC, 1)):
-            below_at = inputs_at
-            for layer, (n_in, n_out) in enumerate(hidden):
-                here_at = work.take(rows * rounded_up(n_out, lanes))
-                layers[network, layer] = Layer(n_in, n_out, *weights[network][layer], below_at, here_at, here_at)
-                below_at = here_at
-            here_at, gradient_at = work.take(outputs * rows), work.take(outputs * rows)
-            layers[network, -1] = Layer(last, outputs, *weights[network][-1], below_at, here_at, gradient_at)
+        layers = np.stack([network.layers(inputs_at, rows, lanes, work) for network in networks])
         plan = Plan(
-            depth=len(hidden), rows=rows, inputs=shape.inputs, outputs=shape.outputs, discrete=shape.discrete,
+            depth=len(shape.hidden), rows=rows, inputs=shape.inputs, outputs=shape.outputs, discrete=shape.discrete,
             tanh=shape.activation == "tanh", length=length, log_std_at=log_std_at, fields=fields,
             record=rounded_up(shape.inputs, lanes) + rounded_up(fields, lanes),
             zeros_at=zeros_at, inputs_at=inputs_at, fields_at=fields_at, shares_at=shares_at,
@@ -181,7 +160,9 @@ class Layout:
         return cls(plan, layers, work.taken, rounded_up(shape.inputs, lanes), places)
 
 
-class _Places:
+class Places:
+    """An array's places, given away one after the other."""
+
     def __init__(self) -> None:
         self.taken = 0
 
@@ -189,6 +170,71 @@ class _Places:
         """The first of so many places; all are multiples of 64 bytes."""
         first, self.taken = self.taken, self.taken + rounded_up(count, BYTES // 4)
         return first
+
+
+@dataclass(frozen=True, eq=False)
+class Perceptron:
+    """Where the parameters of one network lie.
+
+    sizes: units of each layer, the inputs first.  firsts: of each layer, the first places of weights and of biases.
+    numbers: of each layer, the (n_out, n_in) places of its weights and the (n_out,) of its biases.
+    """
+
+    sizes: tuple[int, ...]
+    firsts: tuple[tuple[int, int], ...]
+    numbers: tuple[tuple[NDArray[np.int64], NDArray[np.int64]], ...]
+
+    @classmethod
+    def of(cls, sizes: tuple[int, ...], lanes: int, parameters: Places) -> Perceptron:
+        """Take places for a network of these sizes."""
+        firsts, numbers = [], []
+        for n_in, n_out in itertools.pairwise(sizes[:-1]):
+            below, above = rounded_up(n_in, lanes), rounded_up(n_out, lanes)
+            at = parameters.take(below * above)
+            units, inputs = np.arange(n_out)[:, None], np.arange(n_in)
+            place = at + (units // lanes * below + inputs) * lanes + units % lanes
+            bias = parameters.take(above)
+            firsts.append((at, bias))
+            numbers.append((place, bias + np.arange(n_out)))
+        last, outputs = sizes[-2:]
+        below = rounded_up(last, lanes)
+        at, bias = parameters.take(outputs * below), parameters.take(rounded_up(outputs, lanes))
+        firsts.append((at, bias))
+        place = at + np.arange(outputs)[:, None] * below + np.arange(last)
+        numbers.append((place, bias + np.arange(outputs)))
+        return cls(sizes, tuple(firsts), tuple(numbers))
+
+    def named(self, stems: Sequence[Sequence[str]]) -> dict[str, NDArray[np.int64]]:
+        """Places by SB3's names of parameters.
+
+        stems: of each layer, the names of the linear layers that lie side by side in it, of one size each.
+        """
+        named: dict[str, NDArray[np.int64]] = {}
+        for (weights, biases), heads in zip(self.numbers, stems, strict=True):
+            for stem, weight, bias in zip(
+                heads, np.split(weights, len(heads)), np.split(biases, len(heads)), strict=True
+            ):
+                named |= {f"{stem}.weight": weight.ravel(), f"{stem}.bias": bias}
+        return named
+
+    def layers(self, inputs_at: int, rows: int, lanes: int, work: Places) -> NDArray[np.int64]:
+        """`(depth + 1, 7)` `Layer`s of a network whose inputs lie there; places for what its units say are taken."""
+        layers = np.zeros((len(self.firsts), len(Layer._fields)), dtype=np.int64)
+        below_at = inputs_at
+        for layer, (n_in, n_out) in enumerate(itertools.pairwise(self.sizes[:-1])):
+            here_at = work.take(rows * rounded_up(n_out, lanes))
+            layers[layer] = Layer(n_in, n_out, *self.firsts[layer], below_at, here_at, here_at)
+            below_at = here_at
+        last, outputs = self.sizes[-2:]
+        here_at, gradient_at = work.take(outputs * rows), work.take(outputs * rows)
+        layers[-1] = Layer(last, outputs, *self.firsts[-1], below_at, here_at, gradient_at)
+        return layers
+
+
+def most_weights(sizes: Sequence[int], lanes: int) -> int:
+    """Numbers of the largest matrix between layers of these sizes, 0 if there is one layer only."""
+    padded_sizes = [rounded_up(n, lanes) for n in sizes]
+    return max((a * b for a, b in itertools.pairwise(padded_sizes)), default=0)
 
 
 def aligned(count: int, dtype: Any) -> Array:
@@ -308,7 +354,8 @@ def backward(m: Any, plan: Any, layers: Any, network: int, count: int) -> None:
 
     Hidden units give way to their gradients.
     """
-    _outputs_backward(m, plan, layers, network)
+    _outputs_gradients(m, plan, layers, network)
+    _outputs_below(m, plan, layers, network)
     lanes, rows = width(m), plan.rows
     panel = rows * lanes
     for number in range(plan.depth - 1, -1, -1):
@@ -331,21 +378,66 @@ def backward(m: Any, plan: Any, layers: Any, network: int, count: int) -> None:
             given = here_at + part * panel
             store(m, plan.length + biases_at + part * lanes, _sum_of_rows(m, given, rows))
         if number:
-            for part in range(units // lanes):
-                for below in range(inputs // lanes):
-                    transpose(
-                        m, weights_at + part * strip + below * lanes * lanes,
-                        plan.turned_at + (below * units + part * lanes) * lanes,
-                    )  # fmt: skip
-            for first in range(0, inputs // lanes, GROUP):
-                some = min(GROUP, inputs // lanes - first)
-                _products(
-                    m, plan.sums_at, panel, some, rows, plan.zeros_at, 0, 0, here_at, lanes, 1, panel - lanes, lanes,
-                    plan.turned_at + first * units * lanes, units * lanes, n_out,
-                )  # fmt: skip
-                for at in range(0, some * panel, lanes):
-                    to = below_at + first * panel + at
-                    store(m, to, _through(plan, load(m, plan.sums_at + at), load(m, to)))
+            _units_below(m, plan, layers, network, number)
+
+
+@function
+def pull(m: Any, plan: Any, layers: Any, network: int, to: int) -> None:
+    """Add the gradient of a network's inputs to what lies in panels from `to` on; parameters get no gradients.
+
+    Hidden units give way to their gradients.
+    """
+    lanes, rows = width(m), plan.rows
+    panel = rows * lanes
+    if not plan.depth:
+        n_in, n_out, weights_at, _, _, _, gradient_at = layers[network, 0]
+        inputs = padded(n_in, lanes)
+        for part in range(inputs // lanes):
+            for row in range(rows):
+                at = to + part * panel + row * lanes
+                found = _given(m, weights_at + part * lanes, inputs, gradient_at + row, rows, n_out)
+                store(m, at, load(m, at) + found)
+        return
+    _outputs_below(m, plan, layers, network)
+    for number in range(plan.depth - 1, 0, -1):
+        _units_below(m, plan, layers, network, number)
+    n_in, n_out, weights_at, _, _, here_at, _ = layers[network, 0]
+    inputs, units = padded(n_in, lanes), padded(n_out, lanes)
+    _turn(m, plan.turned_at, weights_at, inputs, units)
+    for first in range(0, inputs // lanes, GROUP):
+        some, at = min(GROUP, inputs // lanes - first), to + first * panel
+        _products(
+            m, at, panel, some, rows, at, lanes, panel, here_at, lanes, 1, panel - lanes, lanes,
+            plan.turned_at + first * units * lanes, units * lanes, n_out,
+        )  # fmt: skip
+
+
+@function
+def _units_below(m: Any, plan: Any, layers: Any, network: int, number: int) -> None:
+    """Gradients of the units below a hidden layer, in their place."""
+    n_in, n_out, weights_at, _, below_at, here_at, _ = layers[network, number]
+    lanes, rows = width(m), plan.rows
+    panel, inputs, units = rows * lanes, padded(n_in, lanes), padded(n_out, lanes)
+    _turn(m, plan.turned_at, weights_at, inputs, units)
+    for first in range(0, inputs // lanes, GROUP):
+        some = min(GROUP, inputs // lanes - first)
+        _products(
+            m, plan.sums_at, panel, some, rows, plan.zeros_at, 0, 0, here_at, lanes, 1, panel - lanes, lanes,
+            plan.turned_at + first * units * lanes, units * lanes, n_out,
+        )  # fmt: skip
+        for at in range(0, some * panel, lanes):
+            to = below_at + first * panel + at
+            store(m, to, _through(plan, load(m, plan.sums_at + at), load(m, to)))
+
+
+@function
+def _turn(m: Any, to: int, weights_at: int, inputs: int, units: int) -> None:
+    """A hidden layer's weights transposed: (panels of units below, units, L)."""
+    lanes = width(m)
+    for part in range(units // lanes):
+        for below in range(inputs // lanes):
+            at = weights_at + (part * inputs + below * lanes) * lanes
+            transpose(m, at, to + (below * units + part * lanes) * lanes)
 
 
 @function
@@ -360,7 +452,8 @@ def _sum_of_rows(m: Any, at: int, rows: int) -> Any:
 
 
 @function
-def _outputs_backward(m: Any, plan: Any, layers: Any, network: int) -> None:
+def _outputs_gradients(m: Any, plan: Any, layers: Any, network: int) -> None:
+    """Of the last layer's parameters."""
     lanes, rows = width(m), plan.rows
     panel = rows * lanes
     n_in, n_out, weights_at, biases_at, below_at, _, gradient_at = layers[network, plan.depth]
@@ -381,12 +474,26 @@ def _outputs_backward(m: Any, plan: Any, layers: Any, network: int) -> None:
                 three = fma(every(m, m[given + row + 2]), load(m, at + 2 * lanes), three)
                 four = fma(every(m, m[given + row + 3]), load(m, at + 3 * lanes), four)
             store(m, plan.length + weights_at + output * inputs + part * lanes, (one + two) + (three + four))
+
+
+@function
+def _outputs_below(m: Any, plan: Any, layers: Any, network: int) -> None:
+    """Gradients of the last hidden units, if there are any, in their place."""
+    lanes, rows = width(m), plan.rows
+    n_in, n_out, weights_at, _, below_at, _, gradient_at = layers[network, plan.depth]
+    inputs = padded(n_in, lanes)
     if plan.depth:
         for part in range(inputs // lanes):
             for row in range(rows):
-                found = every(m, 0.0)
-                for output in range(n_out):
-                    weights = load(m, weights_at + output * inputs + part * lanes)
-                    found = fma(every(m, m[gradient_at + output * rows + row]), weights, found)
-                at = below_at + part * panel + row * lanes
+                at = below_at + (part * rows + row) * lanes
+                found = _given(m, weights_at + part * lanes, inputs, gradient_at + row, rows, n_out)
                 store(m, at, _through(plan, found, load(m, at)))
+
+
+@compiled
+def _given(m: Any, weights_at: int, strip: int, gradient_at: int, rows: int, outputs: int) -> Any:
+    """The gradient of some units below the outputs, of one sample."""
+    found = every(m, 0.0)
+    for output in range(outputs):
+        found = fma(every(m, m[gradient_at + output * rows]), load(m, weights_at + output * strip), found)
+    return found

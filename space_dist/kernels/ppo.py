@@ -11,7 +11,6 @@ import numpy as np
 from space_dist.kernels.build import ready
 from space_dist.kernels.functions import exp, log
 from space_dist.kernels.lanes import (
-    compiled,
     entry,
     every,
     fma,
@@ -25,6 +24,7 @@ from space_dist.kernels.lanes import (
     width,
 )
 from space_dist.kernels.networks import ACTOR, CRITIC, Layout, Shape, backward, forward, padded
+from space_dist.kernels.optimiser import adam, clipping, norm
 
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 # What a minibatch tells of itself: columns.
@@ -199,52 +199,6 @@ def _losses(m: Any, plan: Any, layers: Any, settings: Any, told: Any) -> None:
     told[DIVERGENCE], told[CLIPPED] = total(divergence), total(clips)
 
 
-@function
-def _norm(m: Any, plan: Any) -> Any:
-    """Of the whole gradient."""
-    lanes = width(m)
-    one = two = three = four = every(m, 0.0)
-    for at in range(plan.length, 2 * plan.length, 4 * lanes):
-        first, second = load(m, at), load(m, at + lanes)
-        third, fourth = load(m, at + 2 * lanes), load(m, at + 3 * lanes)
-        one, two = fma(first, first, one), fma(second, second, two)
-        three, four = fma(third, third, three), fma(fourth, fourth, four)
-    return root(np.float64(total((one + two) + (three + four))))
-
-
-@compiled
-def _power(base: float, exponent: int) -> float:
-    """By squaring: the C library's `pow` is another one on another machine."""
-    found = 1.0
-    while exponent:
-        if exponent & 1:
-            found *= base
-        base *= base
-        exponent >>= 1
-    return found
-
-
-@function
-def _adam(m: Any, plan: Any, settings: Any, step: int, norm: float) -> None:
-    """Clip the gradient to the largest norm, and make Adam's step."""
-    lanes, length = width(m), plan.length
-    clip = settings.max_grad_norm / (norm + 1e-6)
-    clip = every(m, clip if clip < 1.0 else 1.0)
-    first = every(m, 1.0 - settings.beta)
-    second, kept = every(m, 1.0 - settings.beta_square), every(m, settings.beta_square)
-    rate = every(m, -settings.learning_rate / (1.0 - _power(settings.beta, step)))
-    unbiased = every(m, 1.0 / root(1.0 - _power(settings.beta_square, step)))
-    eps = every(m, settings.eps)
-    for at in range(0, length, lanes):
-        gradient = load(m, length + at) * clip
-        mean, square = load(m, 2 * length + at), load(m, 3 * length + at)
-        mean = fma(gradient - mean, first, mean)
-        square = fma(gradient * second, gradient, square * kept)
-        store(m, 2 * length + at, mean)
-        store(m, 3 * length + at, square)
-        store(m, at, fma(mean / fma(root(square), unbiased, eps), rate, load(m, at)))
-
-
 @entry
 def update(
     m: Any, plan: Any, layers: Any, settings: Any, samples: Any, orders: Any, size: int, told: Any
@@ -270,10 +224,11 @@ def update(
                 return done, steps, epoch + 1
             backward(m, plan, layers, ACTOR, count)
             backward(m, plan, layers, CRITIC, count)
-            norm = _norm(m, plan)
-            told[done - 1, NORM] = norm
+            length = norm(m, plan.length, 2 * plan.length)
+            told[done - 1, NORM] = length
             steps += 1
-            _adam(m, plan, settings, settings.steps + steps, norm)
+            factor = clipping(settings.max_grad_norm, length)
+            adam(m, plan.length, 0, plan.length, settings, settings.steps + steps, factor)
     return done, steps, len(orders)
 
 

@@ -1,9 +1,10 @@
 """The Stable-Baselines3 adapter: networks, updates, and what a checkpoint must hold of them.
 
 Nothing of SB3 is written twice: what shards collected is put into SB3's own buffers, and SB3's own `train()` learns
-from it. What SB3 does outside `train()` while it collects is done here, per transition. The exceptions, both on request
-and held against SB3's in tests, are `lean` (PPO's `train()` as a compiled function, from `kernels`) and `population`
-with `stacked` and `trust_region` (PPO's on GPUs and sb3-contrib's TRPO's, for many runs at once).
+from it. What SB3 does outside `train()` while it collects is done here, per transition. The exceptions, all on request
+and held against SB3's in tests, are `lean` and `lean_replay` (PPO's `train()`, and DQN's, TD3's and SAC's, as compiled
+functions, from `kernels`) and `population` with `stacked` and `trust_region` (PPO's on GPUs and sb3-contrib's TRPO's,
+for many runs at once).
 """
 
 from __future__ import annotations

@@ -154,10 +154,10 @@ class Network:
         steps = max((int(one["step"]) for one in state.values()), default=0)
         m = aligned(layout.size, self._dtype)
         parts = m[: 4 * layout.plan.length].reshape(4, -1)
-        parts[0, places] = _joined(self._parameters)
+        parts[0, places] = joined(self._parameters)
         if state:
             for part, moment in ((parts[2], "exp_avg"), (parts[3], "exp_avg_sq")):
-                part[places] = _joined([state[parameter][moment] for parameter in self._parameters])
+                part[places] = joined([state[parameter][moment] for parameter in self._parameters])
         told = np.zeros((len(orders) * -(-n // size), TOLD))
         done, made, epochs = prepare(self._dtype).update(
             m, layout.plan, layout.layers, settings._replace(steps=steps), samples.ravel(), orders, size, told
@@ -182,7 +182,7 @@ class Network:
         n = len(samples)
         layout = self._layout(_ROWS)
         m = aligned(layout.size, self._dtype)
-        m[layout.all_places(self._names)] = _joined(self._parameters)
+        m[layout.all_places(self._names)] = joined(self._parameters)
         found = np.zeros((n, layout.plan.outputs), self._dtype), np.zeros(n, self._dtype), np.zeros(n, self._dtype)
         prepare(self._dtype).evaluate(m, layout.plan, layout.layers, samples.ravel(), np.arange(n), *found)
         return found[1:]
@@ -191,7 +191,7 @@ class Network:
         return Layout.of(self._shape, rows, self._dtype.itemsize)
 
 
-def _joined(tensors: Sequence[torch.Tensor]) -> Array:
+def joined(tensors: Sequence[torch.Tensor]) -> Array:
     """All their numbers, one after another."""
     return np.concatenate([tensor.detach().numpy().ravel() for tensor in tensors])
 

@@ -1,4 +1,4 @@
-"""DQN, SAC and TD3: transitions enter SB3's replay buffer in shard order, then SB3's `train()` samples from it."""
+"""DQN, SAC and TD3: transitions enter SB3's replay buffer in shard order; `train()`, SB3's or `lean`, samples it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from space_dist.config import DQNConfig, SACConfig, TD3Config
 from space_dist.envs import Observations
 from space_dist.envs.observations import each, put, take
 from space_dist.learner.interface import Arrays, SB3Learner, schedule
+from space_dist.learner.lean_replay import LEAN
 from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs
 from space_dist.policy import Exploration, Head, MlpPolicy, Statistics
 from space_dist.rollout import Shard
@@ -24,7 +25,7 @@ from space_dist.rollout import Shard
 _OURS = {
     "kind", "policy", "n_steps", "n_episodes", "learning_rate", "learning_rate_schedule", "net_arch", "activation",
     "log_std_init", "gradient_steps_per_step", "action_noise_std", "scored_network",
-    "normalize_observations", "normalize_rewards",
+    "normalize_observations", "normalize_rewards", "update",
 }  # fmt: skip
 
 
@@ -55,7 +56,8 @@ class OffPolicyLearner(SB3Learner):
             settings["max_grad_norm"] = float("inf")
         if isinstance(config, SACConfig):  # SB3's "auto" asks an environment for this number
             settings["target_entropy"] = float(-np.prod(action_space.shape or ()))
-        model: Any = ALGORITHMS[config.kind](
+        algorithm = (LEAN if config.update == "lean" else ALGORITHMS)[config.kind]
+        model: Any = algorithm(
             policy_class(config),
             env=None,
             learning_rate=schedule(config.learning_rate, config.learning_rate_schedule),

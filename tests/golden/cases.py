@@ -64,6 +64,12 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ]),
     "sac": ("pointmass_space", [*_SHORT, f"learner={{kind: sac, n_steps: 128, {_CONTINUOUS}}}"]),
     "td3": ("pointmass_space", [*_SHORT, f"learner={{kind: td3, n_steps: 128, {_CONTINUOUS}}}"]),
+    "dqn lean": ("cartpole_dqn_space", [
+        "budget.steps=1000", "budget.episodes=20", "learner.learning_starts=200", "learner.net_arch=[40, 24]",
+        "learner.update=lean", "tracking.uri=null", "evaluation.episodes=1", "resources.workers=0",
+    ]),
+    "sac lean": ("pointmass_space", [*_SHORT, f"learner={{kind: sac, n_steps: 128, {_CONTINUOUS}, update: lean}}"]),
+    "td3 lean": ("pointmass_space", [*_SHORT, f"learner={{kind: td3, n_steps: 128, {_CONTINUOUS}, update: lean}}"]),
     # environments
     "antgoal": ("antgoal_space", [*_SMALL, *_BULLET]),
     "ballcatching": ("ballcatching_space", [*_SMALL, *_BULLET, "env.kwargs.horizon=20"]),
