@@ -1,0 +1,48 @@
+#!/bin/bash
+# Submits the grid before to SLURM, or goes on with it: what is done stays done.
+# Options, if any, go to sbatch for training and win over train.sbatch: ./submit.sh --partition=other
+# shellcheck disable=SC1003,SC2016,SC2088 # values are quoted whole, whatever they hold
+set -euo pipefail
+quit() {
+  printf '%s\n' "submit.sh: $2" >&2
+  exit "$1"
+}
+cd -- "$(dirname -- "${BASH_SOURCE[0]}")"
+[ -f manifest.json ] || quit 2 "$PWD holds no manifest.json: it needs the whole exported folder"
+command -v sbatch >/dev/null || quit 2 "there is no sbatch here: run this where SLURM is"
+grid=$PWD
+jobs=$grid/slurm_jobs.txt
+mkdir -p -- "$grid" logs
+
+if [ -s "$jobs" ]; then
+  queued=$(squeue --noheader --format=%F --jobs="$(cut -d' ' -f1 "$jobs" | paste -sd,)" 2>/dev/null | sort -u | paste -sd' ') || queued=''
+  if [ -n "$queued" ]; then
+    echo "already in the queue, nothing to do: $queued (scancel ends them, then submit again)"
+    exit 0
+  fi
+fi
+
+submitted=()
+undo() {
+  if [ -n "${submitted[*]-}" ]; then
+    echo "submit.sh: sbatch refused; cancelling what was submitted: ${submitted[*]}" >&2
+    scancel "${submitted[@]}"
+  fi
+}
+trap undo EXIT
+
+# Submits with the arguments after the first, which says what it is; sets `job`.
+submit() {
+  job=$(sbatch --parsable "${@:2}")
+  job=${job%%;*} # of several clusters the name follows
+  submitted+=("$job")
+  echo "$job $1" >>"$jobs.new"
+  echo "$1: job $job"
+}
+
+rm -f -- "$grid/stop" "$jobs.new"
+submit train "$@" train.sbatch
+submit aggregate --dependency=afterany:"$(IFS=: && echo "${submitted[*]}")" aggregate.sbatch
+mv -f -- "$jobs.new" "$jobs"
+trap - EXIT
+echo "submitted 2 runs; results: $grid"
