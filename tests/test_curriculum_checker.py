@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from space_dist import cli
 from space_dist.curricula.checker import DECISIONS, check
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_features
+from tests.commanding import command
 
 BOUNDS = ContextBounds(("a", "b"), np.array([0.0, -10.0]), np.array([2.0, 10.0]))
 FAULTS = {
@@ -113,16 +112,6 @@ def test_a_file_is_read_without_its_environment(tmp_path: Path) -> None:
         assert str(caught.value).startswith(str(path))
     with pytest.raises(ConfigError, match=r"nowhere\.csv: there is no such file"):
         read_features(tmp_path / "nowhere.csv")
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
 
 
 def test_the_command_says_what_is_wrong(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from space_dist import cli
 from space_dist.envs import BATCHED, make_batched
 from space_dist.envs.checker import COMPARED_STEPS, check
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
+from tests.commanding import command
 from tests.faulty_env import Honest
 
 FAULTS = {
@@ -159,33 +158,23 @@ def test_contexts_can_be_given() -> None:
         check("tests.faulty_env:Honest", instances=inside.subset([0]))
 
 
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", "env", "check", *arguments])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
-
-
 def test_the_command_says_it_and_exits_with_2(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert command(monkeypatch, "tests.faulty_env:IgnoresContexts") == 2
+    assert command(monkeypatch, "env", "check", "tests.faulty_env:IgnoresContexts") == 2
     assert "tests.faulty_env:IgnoresContexts: contexts are ignored" in capsys.readouterr().err
-    assert command(monkeypatch, "CartPole-v1") == 2
+    assert command(monkeypatch, "env", "check", "CartPole-v1") == 2
     error = capsys.readouterr().err
     assert error.count("CartPole-v1") == 1
     assert "has no `context_space`" in error
-    assert command(monkeypatch, "tests.faulty_env:HalfUsed") == 0
+    assert command(monkeypatch, "env", "check", "tests.faulty_env:HalfUsed") == 0
     out = capsys.readouterr().out
     assert "note: changing 'drift' alone" in out
     assert "no fault found. Context: gain, drift. Horizon: 12 steps" in out
-    assert command(monkeypatch, "tests.faulty_env:batched", "--kwarg", "kind=Endless") == 2
+    assert command(monkeypatch, "env", "check", "tests.faulty_env:batched", "--kwarg", "kind=Endless") == 2
     assert "do not end" in capsys.readouterr().err
-    assert command(monkeypatch, "tests.faulty_env:batched", "--kwarg", "kind") == 2
+    assert command(monkeypatch, "env", "check", "tests.faulty_env:batched", "--kwarg", "kind") == 2
     assert "is not NAME=VALUE" in capsys.readouterr().err
     file = tmp_path / "contexts.csv"
     file.write_text("id,gain,drift\n0,0.2,0\n1,0.3,0.1\n")
-    assert command(monkeypatch, "tests.faulty_env:FailsAtTheEdge", "--instances", str(file)) == 0
+    assert command(monkeypatch, "env", "check", "tests.faulty_env:FailsAtTheEdge", "--instances", str(file)) == 0

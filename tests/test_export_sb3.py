@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,13 @@ from sb3_contrib import TRPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from space_dist import cli
 from space_dist.building import spec_of
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch, policy_of
 from space_dist.ledger import Ledger
 from space_dist.policy import members_of
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
+from tests.commanding import command
 from tests.test_learners import DISCRETE_LINE, LINE, N_STEPS, PARTS, config_for, learner_section
 
 CLASSES = {"ppo": PPO, "a2c": A2C, "trpo": TRPO, "dqn": DQN, "sac": SAC, "td3": TD3}
@@ -34,15 +33,6 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
                     "budget": {"steps": 4 * N_STEPS}},
     ),
 }  # fmt: skip
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
 
 
 @pytest.mark.parametrize("name", CASES)

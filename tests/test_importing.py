@@ -14,9 +14,9 @@ import gymnasium as gym
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv  # noqa: F401 - likewise, and allowed
 
-from space_dist import cli
 from space_dist.errors import ConfigError
 from space_dist.importing import folders_of_user, load, look_in, why_refused
+from tests.commanding import command
 from tests.patience import PATIENCE
 
 PROGRAM = Path(sys.executable).parent / "space-dist"
@@ -150,16 +150,6 @@ def test_modules_of_libraries_are_told_from_a_users_own() -> None:
     for path in ("tests.tiny_env:make", "nowhere_env:make", ":x", "carl.envs:CARLCartPole",
                  "pybullet_envs_gymnasium:x"):  # fmt: skip
         assert why_refused(path) is None
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
 
 
 def test_reading_a_strangers_config_runs_no_function_of_a_library(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from mlflow import MlflowClient
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from space_dist import cli
 from space_dist import config as configs
 from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.envs import make_batched
@@ -27,6 +25,7 @@ from space_dist.policy import MlpPolicy, to_arrays
 from space_dist.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.rollout import Worker
 from space_dist.tracking import runs, sync
+from tests.commanding import command
 from tests.test_report import finished_run, written
 
 BLUE, GREEN, RED = (0, 114, 178), (0, 158, 115), (213, 94, 0)
@@ -179,16 +178,6 @@ def test_long_episodes_are_thinned_and_show_their_end(corridor: Ledger, tmp_path
         told = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
     assert len(told) <= MAX_FRAMES + 1
     assert sum(told) == pytest.approx(250 * 260 + END_MILLISECONDS, rel=0.02)
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
 
 
 def test_the_command(

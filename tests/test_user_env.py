@@ -13,13 +13,13 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit, TransformReward
 
-from space_dist import cli
 from space_dist.cli import runs
 from space_dist.envs import BatchedEnv, BatchedSingles, make_batched
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import CARTPOLE_BOUNDS, read_csv
 from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger
+from tests.commanding import command
 from tests.faulty_env import HORIZON, Honest
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "your_environment.md"
@@ -169,15 +169,6 @@ def test_half_a_step_of_a_whole_number_is_refused() -> None:
 
 
 # ---- the command line, and the example ----
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
 
 
 def blocks(language: str) -> list[str]:

@@ -1,0 +1,20 @@
+"""The command, in the test's own process."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from space_dist import cli
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """The exit code of `space-dist ARGUMENTS`; where modules are looked for stays as it was."""
+    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    try:
+        cli.main()
+    except SystemExit as error:
+        return int(error.code or 0)
+    return 0
