@@ -12,6 +12,7 @@ import contextlib
 import logging
 import os
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -103,6 +104,54 @@ class Started:
             with contextlib.suppress(psutil.Error):
                 process.kill()
 
+    def end_with_us(self) -> None:
+        """Kill it for a process that ends now: all but the raylet at once, and that one when nobody is left to see it.
+
+        Ray's library ends a process whose raylet is gone, with a code of its own. Until then the raylet is stopped, so
+        that it starts nobody.
+        """
+        self.look()
+        raylets = [process for process in self._known if _name(process) == "raylet"]
+        for process in raylets:
+            with contextlib.suppress(psutil.Error):
+                process.suspend()
+        for process in self._known - set(raylets):
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+        numbers = [str(process.pid) for process in raylets]
+        try:
+            subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", _KILL_BEHIND, str(os.getpid()), *numbers], start_new_session=True,
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+        except OSError:
+            for process in raylets:
+                with contextlib.suppress(psutil.Error):
+                    process.kill()
+
+
+# Kills processes once the one that started it is gone.
+_KILL_BEHIND = """
+import os, signal, sys, time
+own, *numbers = map(int, sys.argv[1:])
+until = time.monotonic() + 10.0
+while os.getppid() == own and time.monotonic() < until:
+    time.sleep(0.01)
+for number in numbers:
+    try:
+        os.kill(number, signal.SIGKILL)
+    except OSError:
+        pass
+"""
+
+
+def _name(process: psutil.Process) -> str:
+    try:
+        name: str = process.name()
+    except psutil.Error:
+        return ""
+    return name
+
 
 def _is_of_ray(process: psutil.Process) -> bool:
     try:
@@ -184,7 +233,7 @@ def _end(sentence: str, started: Started | None, code: int, note: Note) -> None:
         noting.start()
         noting.join(_NOTE_SECONDS)
         if started is not None:
-            started.end(0.0)
+            started.end_with_us()
     finally:
         os._exit(code)
 

@@ -158,3 +158,45 @@ def test_a_grid_whose_own_ray_dies_ends_with_75(tmp_path: Path) -> None:
         assert psutil.wait_procs(below, timeout=PATIENCE)[1] == []
     finally:
         end(below, run)
+
+
+ENDS = """
+import os, subprocess, sys
+from pathlib import Path
+import psutil
+from space_dist import ray_watch
+
+started, folder, found = ray_watch.Started(), Path(sys.argv[1]), {}
+for name in ("raylet", "gcs_server"):
+    (folder / name).write_text(f"#!{sys.executable}\\nimport time\\ntime.sleep(600)\\n")
+    (folder / name).chmod(0o755)
+    found[name] = subprocess.Popen([folder / name]).pid
+    while psutil.Process(found[name]).name() != name:
+        pass
+really = os._exit
+
+def end(code):
+    print(found["raylet"], found["gcs_server"], psutil.Process(found["raylet"]).status(), flush=True)
+    really(code)
+
+os._exit = end
+ray_watch._end("it hangs", started, 75, ray_watch.nowhere)
+"""
+
+
+def test_a_process_that_ends_with_its_ray_is_gone_before_its_raylet(tmp_path: Path) -> None:
+    """Ray's library, which sees that its raylet is gone, would end it with a code of its own."""
+    folder = tmp_path / "ray"
+    folder.mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", ENDS, folder], capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE, check=False
+    )  # fmt: skip
+    assert done.returncode == 75, done.stderr
+    assert done.stderr.endswith("space-dist: it hangs\n")
+    raylet, gcs_server, status = done.stdout.split()
+    assert status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+    deadline = time.monotonic() + PATIENCE
+    while psutil.pid_exists(int(raylet)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not psutil.pid_exists(int(raylet))
+    assert not psutil.pid_exists(int(gcs_server))
