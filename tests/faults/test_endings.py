@@ -82,7 +82,7 @@ def test_an_exit_with_0_is_a_failure(
     ("where", "after", "fault", "words"),
     [
         ("constructor", 0, "_exit", "os._exit(0)"),
-        ("constructor", 9, "_exit", "os._exit(0)"),  # of the run itself, which has its folder by then
+        ("constructor", 3, "_exit", "os._exit(0)"),  # of the run itself, which has its folder by then
         ("reset", 0, "exit", "SystemExit: 0"),
     ],
 )
