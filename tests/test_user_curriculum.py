@@ -172,6 +172,7 @@ def test_columns_of_the_instances_reach_it(example: Path) -> None:
     ("curriculum", "words"),
     [
         ('import: "faulty:Nobody"', "curriculum.import 'faulty:Nobody': cannot import 'faulty': ModuleNotFoundError"),
+        ('import: "tests.faulty_curricula:Honnest"', "has no class 'Honnest'; did you mean 'Honest'?"),
         ('import: "tests.faulty_curricula:nothing"', "made a str, which is no curriculum"),
         ('import: "tests.faulty_curricula:WantsEnsemble"', "it wants the values of an ensemble"),
         ('import: "tests.faulty_curricula:Honest", kwargs: {size: 3}', "unexpected keyword argument 'size'"),

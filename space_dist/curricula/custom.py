@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NoReturn
 
@@ -27,7 +28,7 @@ from space_dist.curricula.interface import (
     State,
     Wants,
 )
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import ConfigError, SpaceDistError, nearest
 from space_dist.importing import load
 from space_dist.instances import ContextBounds, InstanceSet
 
@@ -51,7 +52,9 @@ def make_custom(
     module, _, name = import_path.partition(":")
     found = load(import_path, KEY)
     if not callable(found):
-        raise ConfigError(f"{where}: {module!r} has no class {name!r}")
+        own = [known for known, value in vars(sys.modules[module]).items()
+               if isinstance(value, type) and issubclass(value, Curriculum)]  # fmt: skip
+        raise ConfigError(f"{where}: {module!r} has no class {name!r}{nearest(name, own)}")
     signature = _signature(found)
     offered: dict[str, Any] = {"seed": seed, "draws": draws, "bounds": bounds}
     given = {each: value for each, value in offered.items() if signature is None or each in signature.parameters}
