@@ -261,6 +261,23 @@ def test_the_same_round_gives_the_same_bits_and_another_seed_others() -> None:
     assert first != second == third
 
 
+def assert_resumed_to_the_same_bytes(run: configs.RunConfig, tmp_path: Path) -> None:
+    """A run of 8 rounds of 128 steps: left alone, and stopped in the third and resumed."""
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    launch(run, whole, resume=False, stop=StopRequests())
+
+    def stop_at_the_third(progress: Progress) -> None:
+        if progress.steps == 3 * 128:
+            Ledger(parts).stop_file.touch()
+
+    with pytest.raises(Interrupted):
+        launch(run, parts, resume=False, stop=StopRequests(), observe=stop_at_the_third)
+    assert 0 < Ledger(parts).status().steps < 8 * 128
+    launch(run, parts, resume=True, stop=StopRequests())
+    for name in ("metrics.jsonl", "curriculum.jsonl", "model.npz"):
+        assert (parts / name).read_bytes() == (whole / name).read_bytes(), name
+
+
 def test_a_run_that_is_stopped_and_resumed_is_the_same_byte_for_byte(tmp_path: Path) -> None:
     for split, targets in (("train", (-0.75, 0.75)), ("test", (-0.7, 0.7))):
         rows = "".join(f"{number},{target}\n" for number, target in enumerate(targets))
@@ -275,19 +292,7 @@ def test_a_run_that_is_stopped_and_resumed_is_the_same_byte_for_byte(tmp_path: P
         },
         "test",
     )  # fmt: skip
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    launch(run, whole, resume=False, stop=StopRequests())
-
-    def stop_at_the_third(progress: Progress) -> None:
-        if progress.steps == 3 * 128:
-            Ledger(parts).stop_file.touch()
-
-    with pytest.raises(Interrupted):
-        launch(run, parts, resume=False, stop=StopRequests(), observe=stop_at_the_third)
-    assert 0 < Ledger(parts).status().steps < 8 * 128
-    launch(run, parts, resume=True, stop=StopRequests())
-    for name in ("metrics.jsonl", "curriculum.jsonl", "model.npz"):
-        assert (parts / name).read_bytes() == (whole / name).read_bytes(), name
+    assert_resumed_to_the_same_bytes(run, tmp_path)
 
 
 @pytest.mark.parametrize("reward", [np.nan, np.inf])

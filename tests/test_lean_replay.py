@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from space_dist import config as configs
 from space_dist import learner as learners
 from space_dist.building import resolved, spec_of
-from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.interrupts import StopRequests
 from space_dist.launch import launch
 from space_dist.learner import lean_replay, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
-from space_dist.training import Progress
-from tests.test_lean import Casting, close
+from tests.test_lean import Casting, assert_resumed_to_the_same_bytes, close
 from tests.test_off_policy import CONFIGS, KINDS, ROUND, SEED, STEPS, Stream, action_space, learn, rounds_of, stream_for
 
 UPDATES = 20  # that learn, after two rounds of random actions
@@ -291,19 +290,7 @@ def run_config(kind: str, folder: Path, workers: int = 0) -> configs.RunConfig:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_that_is_stopped_and_resumed_is_the_same_byte_for_byte(kind: str, tmp_path: Path) -> None:
-    run, whole, parts = run_config(kind, tmp_path), tmp_path / "whole", tmp_path / "parts"
-    launch(run, whole, resume=False, stop=StopRequests())
-
-    def stop_at_the_third(progress: Progress) -> None:
-        if progress.steps == 3 * 128:
-            Ledger(parts).stop_file.touch()
-
-    with pytest.raises(Interrupted):
-        launch(run, parts, resume=False, stop=StopRequests(), observe=stop_at_the_third)
-    assert 0 < Ledger(parts).status().steps < 8 * 128
-    launch(run, parts, resume=True, stop=StopRequests())
-    for name in RESULTS:
-        assert (parts / name).read_bytes() == (whole / name).read_bytes(), name
+    assert_resumed_to_the_same_bytes(run_config(kind, tmp_path), tmp_path)
 
 
 @pytest.mark.ray
