@@ -31,13 +31,13 @@ from space_dist.errors import SpaceDistError
 from space_dist.manifest import Grid
 
 ROOT = Path(__file__).resolve().parents[2]
-MARGIN = 0.1  # share of the pilot's mean return
+MARGIN = 0.05  # share of the pilot's mean return
 ALPHA = 0.05  # of each one-sided test
-POWER = 0.8  # where there is no difference
-PILOT = range(1000, 1012)
+POWER = 0.9  # where there is no difference
+PILOT = range(5000, 5024)
 CONFIDENCE = 0.9  # in the limit of the pilot's standard deviation
-ARMS = {"sb3": 2000, "population": 3000, "control": 4000}  # their first seeds
-FEWEST, MOST = 10, 60  # seeds per arm
+ARMS = {"sb3": 6000, "population": 7000, "control": 8000}  # their first seeds
+FEWEST, MOST = 10, 200  # seeds per arm
 console = Console()
 
 
