@@ -7,7 +7,7 @@ Takes the arguments of `space-dist grid run`. Inside a Ray job the runs join tha
 import sys
 
 from space_dist.cli import main
-from space_dist.place import in_ray_job
+from space_dist.system.workplace import in_ray_job
 
 if __name__ == "__main__":
     arguments = ["grid", "run", *sys.argv[1:]]

@@ -13,7 +13,7 @@ from space_dist.cli.grids import frozen, run_frozen, tell
 from space_dist.cli.runs import print_grid_report
 from space_dist.cli.terminal import STOP, console, say, warn
 from space_dist.errors import Interrupted, SpaceDistError
-from space_dist.standing import Standing
+from space_dist.experiment.status import Standing
 
 ROOT = Path(__file__).resolve().parent.parent
 INSTANCES = 100

@@ -7,7 +7,7 @@ Takes the arguments of `space-dist train`. Inside a Ray job the run joins that c
 import sys
 
 from space_dist.cli import main
-from space_dist.place import in_ray_job
+from space_dist.system.workplace import in_ray_job
 
 if __name__ == "__main__":
     arguments = ["train", *sys.argv[1:]]

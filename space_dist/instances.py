@@ -1,4 +1,4 @@
-"""Instance sets: which contexts a run trains and is tested on. Read, checked, written and sampled here.
+"""Instance sets: which contexts a run trains and is tested on. Read, checked and written here.
 
 An *instance* is one context (a feature vector) with an id. Sets live in CSV files, one instance a line: `id` and one
 column a feature. A file is checked whole before a run starts, because a bad row found after hours costs those hours.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import stat
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -18,14 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import ConfigError, about, nearest
-from space_dist.mazes import CELLS, SIDE, carve, symmetrised
-from space_dist.seeding import Purpose, generator
 
 MAX_FILE_BYTES: Final = 512 * 2**20
 MAX_LINE_BYTES: Final = 2**20  # some 40,000 features; a file without line ends never gets into memory whole
 MAX_INSTANCES: Final = 10_000_000
 MAX_ID: Final = 2**63 - 1
-MAX_REDRAWS: Final = 100
 _BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
 _WIDE: Final = 1e300  # bounds where none are known
 
@@ -52,7 +49,7 @@ class ContextBounds:
         if not usable.all():
             bad = int(np.argmin(usable))
             raise ConfigError(
-                f"feature {_shown(self.names[bad])} has bounds [{low[bad]}, {high[bad]}]: "
+                f"feature {shown(self.names[bad])} has bounds [{low[bad]}, {high[bad]}]: "
                 "they must be finite, the lower below the higher"
             )
         _freeze(self, low=low, high=high)
@@ -110,7 +107,7 @@ class InstanceSet:
         if not np.isfinite(contexts).all():
             row, feature = np.argwhere(~np.isfinite(contexts))[0]
             raise ConfigError(
-                f"instance {given[row]} has {_shown(self.names[feature])} = {contexts[row, feature]}: "
+                f"instance {given[row]} has {shown(self.names[feature])} = {contexts[row, feature]}: "
                 "contexts must be finite"
             )
         order = np.argsort(given, kind="stable")
@@ -122,7 +119,7 @@ class InstanceSet:
         columns = {name: np.asarray(values, dtype=np.float64) for name, values in self.columns.items()}
         for name, values in columns.items():
             if values.shape != given.shape or not np.isfinite(values).all():
-                raise ConfigError(f"the column {_shown(name)} must hold one finite number for each instance")
+                raise ConfigError(f"the column {shown(name)} must hold one finite number for each instance")
             columns[name] = values[order] + 0.0
             columns[name].setflags(write=False)
         object.__setattr__(self, "columns", columns)
@@ -235,7 +232,7 @@ def refuse_overlap(train: InstanceSet, test: InstanceSet, train_name: str, test_
             f"{train_name} and {test_name} have different features: "
             f"{_cut(', '.join(train.names), 120)} and {_cut(', '.join(test.names), 120)}"
         )
-    first, second = _repeats(np.vstack((train.contexts, test.contexts)))
+    first, second = repeats(np.vstack((train.contexts, test.contexts)))
     crossing = (first < len(train)) & (second >= len(train))
     if crossing.any():
         train_ids, test_ids = train.ids[first[crossing]], test.ids[second[crossing] - len(train)]
@@ -313,20 +310,20 @@ def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], 
     try:
         columns = [cell.decode().strip() for cell in _split(row, line)]
     except UnicodeDecodeError:
-        raise ConfigError(f"row 1 is not UTF-8 text: {_shown(line)}") from None
+        raise ConfigError(f"row 1 is not UTF-8 text: {shown(line)}") from None
     if columns == [""]:
         raise ConfigError(f"row 1 is blank where the columns must be named: {allowed}")
     known, seen = set(expected), set[str]()
     for column in columns:
         if column not in known:
             missing = sorted(known.difference(columns))
-            raise ConfigError(f"row 1: unknown column {_shown(column)}{nearest(column[:100], missing)} ({allowed})")
+            raise ConfigError(f"row 1: unknown column {shown(column)}{nearest(column[:100], missing)} ({allowed})")
         if column in seen:
-            raise ConfigError(f"row 1: the column {_shown(column)} is there twice ({allowed})")
+            raise ConfigError(f"row 1: the column {shown(column)} is there twice ({allowed})")
         seen.add(column)
     for name in required:
         if name not in seen:
-            raise ConfigError(f"row 1: the column {_shown(name)} is missing ({allowed})")
+            raise ConfigError(f"row 1: the column {shown(name)} is missing ({allowed})")
     return columns
 
 
@@ -357,7 +354,7 @@ def _read_rows(
         if len(cells) != len(columns):
             raise ConfigError(
                 f"row {row} has {len(cells)} cells where row 1 names {len(columns)} columns "
-                f"({_cut(', '.join(columns), 200)}): {_shown(line)}"
+                f"({_cut(', '.join(columns), 200)}): {shown(line)}"
             )
         position = id_position
         try:
@@ -403,17 +400,17 @@ def _cell_fault(row: int, columns: Sequence[str], cells: Sequence[bytes], positi
             what = "is outside the bounds" if np.isfinite(float(cell)) else "is not finite"
         except ValueError:
             what = "is not a number"
-    return f"row {row}, column {_shown(column)}: {_shown(cell)} {what}; allowed is {allowed}"
+    return f"row {row}, column {shown(column)}: {shown(cell)} {what}; allowed is {allowed}"
 
 
 def _refuse_repeats(ids: NDArray[np.int64], contexts: NDArray[np.float64]) -> None:
     """Refuse an id or a context that is there twice. Rows are `(n,)` and `(n, d)` in the order of the file."""
-    first, second = _repeats(ids[:, np.newaxis])
+    first, second = repeats(ids[:, np.newaxis])
     if second.size:
         raise ConfigError(
             f"row {first[0] + 2} and row {second[0] + 2}, column 'id': both are {ids[first[0]]}; each id may occur once"
         )
-    first, second = _repeats(contexts)
+    first, second = repeats(contexts)
     if second.size:
         raise ConfigError(
             f"row {first[0] + 2} (id {ids[first[0]]}) and row {second[0] + 2} (id {ids[second[0]]}) "
@@ -421,7 +418,7 @@ def _refuse_repeats(ids: NDArray[np.int64], contexts: NDArray[np.float64]) -> No
         )
 
 
-def _repeats(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def repeats(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(earlier, later): for each of the k rows of `(n, d)` that occurred before, where it did last, and its own index.
 
     Both are `(k,)`, sorted by the later.
@@ -441,12 +438,12 @@ def _check_names(names: tuple[str, ...]) -> None:
     for name in names:
         if name == "id" or name != name.strip() or not name or not name.isprintable() or set(name) & set(',"'):
             raise ConfigError(
-                f"{_shown(name)} cannot name a feature: names are printable, neither 'id' nor empty, "
+                f"{shown(name)} cannot name a feature: names are printable, neither 'id' nor empty, "
                 "without commas, double quotes or surrounding spaces"
             )
     if len(set(names)) < len(names):
         doubled = next(name for name in names if names.count(name) > 1)
-        raise ConfigError(f"the feature {_shown(doubled)} is named twice")
+        raise ConfigError(f"the feature {shown(doubled)} is named twice")
 
 
 def _freeze(owner: ContextBounds | InstanceSet, **arrays: NDArray[np.generic]) -> None:
@@ -460,7 +457,7 @@ def _cut(text: str, limit: int) -> str:
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
-def _shown(found: str | bytes) -> str:
+def shown(found: str | bytes) -> str:
     """What was found, quoted and cut short: it may be hostile, and a terminal shall not act on it."""
     found = found[:200]
     if isinstance(found, bytes):
@@ -475,170 +472,3 @@ def _shown_path(path: Path) -> str:
     """The path as it is where that is short and printable; else quoted, and its end, which tells files apart."""
     text = str(path) if str(path).isprintable() else repr(str(path))
     return text if len(text) <= 200 else "…" + text[-199:]
-
-
-POINTMASS_BOUNDS: Final = ContextBounds(
-    names=("gate_x", "gate_width", "friction"),
-    low=np.array([-4.0, 0.5, 0.0]),
-    high=np.array([4.0, 8.0, 4.0]),
-)
-"""PointMass (Klink et al. 2020): centre and width of the gate in the world's length units, friction in 1/s."""
-
-CARTPOLE_BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), high=np.array([1.0]))
-"""CartPole: *half* the pole's length in metres, as Gymnasium's `length` is. The bounds are ours.
-
-`configs/instances/cartpole_train.csv` holds the paper's three poles: 0.3, 0.4 and 0.5. The paper holds none out; the
-four of `cartpole_test.csv` are ours: one between each two of them, and one beyond each end.
-"""
-
-ANTGOAL_BOUNDS: Final = ContextBounds(
-    names=("goal_x", "goal_y", "disabled_leg"),
-    low=np.array([-750.0, -750.0, -1.0]),
-    high=np.array([750.0, 750.0, 3.0]),
-)
-"""AntGoal (Eimer et al. 2021): the goal in metres from the start, and the disabled leg, a whole number: -1 for none."""
-
-BALLCATCHING_BOUNDS: Final = ContextBounds(
-    names=("angle", "radius", "distance"),
-    low=np.array([0.125 * np.pi, 0.52, 0.75]),
-    high=np.array([0.5 * np.pi, 0.95, 4.0]),
-)
-"""BallCatching (Klink et al. 2020): angle in radians and radius in metres of the point that the ball flies to, seen
-from the arm's shoulder, and the distance in metres from which it comes.
-
-Klink et al. have radii from 0.6 to 1.1 for their longer arm: ours are these times 0.95 / 1.1, because the net's centre
-reaches 1.07 m.
-"""
-MAZE_BOUNDS: Final = ContextBounds(
-    names=tuple(f"cell_{x}_{y}" for y in range(SIDE) for x in range(SIDE)),
-    low=np.zeros(CELLS),
-    high=np.full(CELLS, 15.0),
-)
-"""Maze: the bits of each cell's open sides (north 1, east 2, south 4, west 8), in reading order; `cell_x_y`."""
-
-
-@dataclass(frozen=True)
-class Distribution:
-    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows.
-
-    `content` turns `(n, d)` contexts into rows that are equal where two contexts mean the same.
-    """
-
-    description: str
-    source: str
-    bounds: ContextBounds
-    draw: Callable[[np.random.Generator, int], NDArray[np.float64]]
-    content: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda contexts: contexts
-
-
-def _draw_pointmass_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    return rng.uniform(POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high, size=(n, 3))
-
-
-def _draw_pointmass_target(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """The target N((2.5, 0.5, 0), sigma (4e-3, 3.75e-3, 2e-3)), *clipped* to the bounds.
-
-    Two of its means lie on a lower bound, so about half of the gate widths are exactly 0.5 and half of the frictions
-    exactly 0.
-    """
-    drawn = rng.normal((2.5, 0.5, 0.0), (4e-3, 3.75e-3, 2e-3), size=(n, 3))
-    return np.clip(drawn, POINTMASS_BOUNDS.low, POINTMASS_BOUNDS.high)
-
-
-def _draw_antgoal(rng: np.random.Generator, n: int, nearest_goal: float) -> NDArray[np.float64]:
-    """Goals uniform between `nearest_goal` and 750 on each axis; none or one of four legs, each as likely."""
-    goals = rng.uniform(nearest_goal, ANTGOAL_BOUNDS.high[:2], size=(n, 2))
-    return np.column_stack((goals, rng.integers(-1, 4, size=n)))
-
-
-DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
-    "pointmass_uniform": Distribution(
-        description="PointMass, each feature uniform within its bounds",
-        source="Klink et al. 2020 (the bounds)",
-        bounds=POINTMASS_BOUNDS,
-        draw=_draw_pointmass_uniform,
-    ),
-    "pointmass_target": Distribution(
-        description="PointMass, N((2.5, 0.5, 0), sigma (4e-3, 3.75e-3, 2e-3)) clipped to the bounds, which puts "
-        "about half of the gate widths at 0.5 and half of the frictions at 0",
-        source="Klink et al. 2020 (the target distribution); the clipping is ours",
-        bounds=POINTMASS_BOUNDS,
-        draw=_draw_pointmass_target,
-    ),
-    "cartpole_uniform": Distribution(
-        description="CartPole, half the pole's length uniform within its bounds",
-        source="ours; the paper has only the three poles of cartpole_train.csv and no test set",
-        bounds=CARTPOLE_BOUNDS,
-        draw=lambda rng, n: rng.uniform(CARTPOLE_BOUNDS.low, CARTPOLE_BOUNDS.high, size=(n, 1)),
-    ),
-    "antgoal_positive": Distribution(
-        description="AntGoal, goals uniform in the positive quadrant up to 750 on each axis; no leg or one of four "
-        "disabled, each with probability 1/5",
-        source="Eimer et al. 2021; the quadrant is the released code's",
-        bounds=ANTGOAL_BOUNDS,
-        draw=lambda rng, n: _draw_antgoal(rng, n, 0.0),
-    ),
-    "antgoal_all": Distribution(
-        description="AntGoal, goals uniform in all four quadrants up to 750 on each axis; no leg or one of four "
-        "disabled, each with probability 1/5",
-        source="Eimer et al. 2021 (goals at most 750 away)",
-        bounds=ANTGOAL_BOUNDS,
-        draw=lambda rng, n: _draw_antgoal(rng, n, -750.0),
-    ),
-    "ballcatching_uniform": Distribution(
-        description="BallCatching, each feature uniform within its bounds",
-        source="Klink et al. 2020 (the bounds); the radius is scaled to our arm",
-        bounds=BALLCATCHING_BOUNDS,
-        draw=lambda rng, n: rng.uniform(BALLCATCHING_BOUNDS.low, BALLCATCHING_BOUNDS.high, size=(n, 3)),
-    ),
-    "maze_dfs": Distribution(
-        description="Maze, perfect 5x5 mazes carved depth first from a random cell, symmetrised",
-        source="gym-maze's generator; the paper released no settings",
-        bounds=MAZE_BOUNDS,
-        draw=carve,
-    ),
-    "maze_dfs_raw": Distribution(
-        description="Maze, the mazes of maze_dfs with the released code's numbers, which depend on where the carving "
-        "began",
-        source="gym-maze's generator",
-        bounds=MAZE_BOUNDS,
-        draw=lambda rng, n: carve(rng, n, raw=True),
-        content=symmetrised,
-    ),
-}
-
-
-def sample(
-    distribution: str, n_train: int, n_test: int, seed: int, known: Mapping[str, Distribution] | None = None
-) -> tuple[InstanceSet, InstanceSet]:
-    """A training set (ids 0 .. n_train - 1) and a test set (the ids after), from one of the `known` (DISTRIBUTIONS).
-
-    They are disjoint by construction: one set of distinct contexts is drawn, what repeats drawn again, and then
-    split. A pure function of its arguments. Raises ConfigError for an unknown distribution, for counts below 1
-    or above 10 million together, for a negative seed, and if there are not that many distinct contexts to be found.
-    """
-    known = DISTRIBUTIONS if known is None else known
-    if distribution not in known:
-        raise ConfigError(
-            f"unknown distribution {_shown(distribution)}{nearest(distribution[:100], known)} "
-            f"(known are {', '.join(known)})"
-        )
-    total = n_train + n_test
-    if min(n_train, n_test) < 1 or total > MAX_INSTANCES:
-        raise ConfigError(
-            f"cannot sample {n_train} training and {n_test} test instances: at least 1 of each, "
-            f"at most {MAX_INSTANCES} together"
-        )
-    if seed < 0:
-        raise ConfigError(f"the seed {seed} is negative; allowed are whole numbers from 0")
-    chosen = known[distribution]
-    rng = generator(seed, Purpose.INSTANCES, int.from_bytes(distribution.encode(), "big"), n_train, n_test)
-    contexts = np.empty((0, len(chosen.bounds.names)))
-    for _ in range(MAX_REDRAWS):
-        contexts = np.vstack((contexts, chosen.draw(rng, total - len(contexts))))
-        contexts = np.delete(contexts, _repeats(chosen.content(contexts))[1], axis=0)
-        if len(contexts) == total:
-            ids, names = np.arange(total), chosen.bounds.names
-            train = InstanceSet(ids[:n_train], contexts[:n_train], names)
-            return train, InstanceSet(ids[n_train:], contexts[n_train:], names)
-    raise ConfigError(f"found only {len(contexts)} distinct contexts of {distribution} where {total} were asked for")

@@ -61,7 +61,7 @@ def _sb3_logs_in_pytests_folder(tmp_path_factory: pytest.TempPathFactory) -> Non
 @pytest.fixture(scope="session")
 def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A database with MLflow's tables: making them takes seconds, so it happens once, for all of pytest's processes."""
-    from space_dist.files import locked
+    from space_dist.system.files import locked
     from space_dist.tracking import sync
     from tests.patience import PATIENCE
     from tests.test_report import start_run
@@ -92,12 +92,12 @@ def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
 @pytest.fixture(scope="module")
 def one_ray() -> Iterator[None]:
     """One private Ray for all clusters of a module: to start it takes longer than the runs."""
-    from space_dist.place import private_ray
+    from space_dist.system.workplace import private_ray
 
     private_ray()
     import ray
 
-    from space_dist.distributed import join_ray, remove_session
+    from space_dist.run.ray_cluster import join_ray, remove_session
 
     found = join_ray("local", 5)
     joined = SimpleNamespace(address_info={**found, "session_dir": None})

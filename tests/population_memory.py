@@ -11,9 +11,9 @@ from pathlib import Path
 
 from space_dist.config import load
 from space_dist.errors import SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import Outcome
-from space_dist.population import advance, member
+from space_dist.run.launch import Outcome
+from space_dist.run.population import advance, member
+from space_dist.system.interrupts import StopRequests
 
 
 def raised(_: Path, outcome: Outcome | SpaceDistError) -> None:

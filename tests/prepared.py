@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["space_dist.cli.runs", "space_dist.launch", "stable_baselines3"])
+_CONTEXT.set_forkserver_preload(["space_dist.cli.runs", "space_dist.run.launch", "stable_baselines3"])
 _ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -56,8 +56,8 @@ def _command(arguments: list[str], output: str, environment: dict[str, str], bef
 
 def _slow_run(config: str, folder: str, seconds: float) -> None:
     from space_dist import config as configs
-    from space_dist.interrupts import StopRequests
-    from space_dist.launch import launch
+    from space_dist.run.launch import launch
+    from space_dist.system.interrupts import StopRequests
 
     chosen = configs.load(Path(config))
     launch(chosen, Path(folder), resume=True, stop=StopRequests(), observe=lambda _: time.sleep(seconds))

@@ -14,11 +14,11 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.arithmetic import digest, scipy_probes
-from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.errors import SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, read_instances
 from space_dist.ledger import METRICS, Ledger
+from space_dist.run.building import learner_of, make_setup, spec_of
+from space_dist.run.launch import launch, read_instances
+from space_dist.system.interrupts import StopRequests
 from tests.patience import PATIENCE
 from tests.test_distributed import ROOT, cluster_class, config, reference, results  # noqa: F401
 from tests.test_learners import config_for, learner_section
@@ -35,7 +35,7 @@ def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -
     with cluster_class(run, setup) as cluster:
         policy = cluster.put(learner_of(run, spec).policy(0))
         decision = cluster.begin(cluster.start_values(policy))
-        from space_dist.walk import Walk
+        from space_dist.rollout.walk import Walk
 
         shards = cluster.collect(policy, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
         assert len(cluster.get([*shards, *cluster.evaluate(policy, "test")])) == 2 * run.rollout.shards
@@ -105,7 +105,7 @@ def test_actors_are_compared_by_all_that_they_compute_with(
     env_id: str, kind: str, rollout: tuple[str, ...], central: tuple[str, ...], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    from space_dist import distributed
+    from space_dist.run import ray_cluster as distributed
 
     policy = {"policy": "MultiInputPolicy"} if env_id.endswith("dict") else {}
     config = config_for(tmp_path, learner_section("ppo", **policy), env_id)

@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from space_dist.envs import BatchedAntGoal, make_batched
+from space_dist.envs.antgoal import BOUNDS as ANTGOAL_BOUNDS
 from space_dist.envs.antgoal import HEALTHY_HEIGHT
-from space_dist.instances import ANTGOAL_BOUNDS, sample
+from space_dist.envs.distributions import sample
 
 ENV_ID = "space_dist/AntGoal-v0"
 FloatArray = NDArray[np.float64]

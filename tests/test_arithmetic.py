@@ -16,9 +16,9 @@ from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.arithmetic import REFERENCE, SETTINGS, digest, numpy_digest, remarks, settle
 from space_dist.errors import ConfigError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.learner import torch_probes
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent

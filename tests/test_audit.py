@@ -18,15 +18,15 @@ import pytest
 from typer.testing import CliRunner
 
 from space_dist import config as configs
-from space_dist import training
-from space_dist.building import spec_of
 from space_dist.cli import app
 from space_dist.errors import Interrupted, LedgerError
 from space_dist.instances import read_csv
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import CURRICULUM, METRICS, VALUES, Ledger, decode_values, encode_row, encode_values
 from space_dist.report.decisions import explain
+from space_dist.run import training
+from space_dist.run.building import spec_of
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 
 ROOT = Path(__file__).resolve().parent.parent
 AUDIT = ROOT / "jobs/audit.py"

@@ -26,7 +26,8 @@ from space_dist.envs.ballcatching import (
     flight_time_of,
     target_of,
 )  # fmt: skip
-from space_dist.instances import BALLCATCHING_BOUNDS, read_csv
+from space_dist.envs.ballcatching import BOUNDS as BALLCATCHING_BOUNDS
+from space_dist.instances import read_csv
 
 INSTANCES = Path(__file__).parent.parent / "configs" / "instances"
 FloatArray = NDArray[np.float64]

@@ -18,8 +18,9 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from space_dist.envs import BatchedEnv, ContextObservation, bullet, make_batched
+from space_dist.envs.distributions import DISTRIBUTIONS, sample
 from space_dist.errors import ConfigError
-from space_dist.instances import DISTRIBUTIONS, read_csv, refuse_overlap, sample
+from space_dist.instances import read_csv, refuse_overlap
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parent.parent

@@ -19,8 +19,8 @@ from space_dist.cli import runs
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.envs.checker import check
 from space_dist.errors import ConfigError
-from space_dist.interrupts import StopRequests
 from space_dist.ledger import Ledger
+from space_dist.system.interrupts import StopRequests
 
 CLASSIC = {
     "CARLCartPole": "length, gravity [5, 15]",

@@ -11,7 +11,8 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from space_dist.envs import BatchedCartPole, ContextObservation, ContextVisible, make_batched
-from space_dist.instances import CARTPOLE_BOUNDS, read_csv, refuse_overlap
+from space_dist.envs.cartpole import BOUNDS as CARTPOLE_BOUNDS
+from space_dist.instances import read_csv, refuse_overlap
 
 ENV_ID = "space_dist/CartPole-v0"
 INSTANCES = Path(__file__).parent.parent / "configs" / "instances"

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 from space_dist import cli
 from space_dist.cli import runs, terminal
-from space_dist.interrupts import StopRequests
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.patience import PATIENCE
 

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from space_dist.curricula import Curriculum, Feedback, RoundRobin, Selection, SetState, Space, variants
 from space_dist.curricula.space import _highest
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
+from space_dist.rollout.walk import Walk
 from space_dist.seeding import Purpose, instance_keys
-from space_dist.walk import Walk
 
 KINDS = ("space", "random_growth", "round_robin")
 

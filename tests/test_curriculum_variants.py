@@ -18,13 +18,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from space_dist.building import make_setup, spec_of
-from space_dist.cluster import Central, make_curriculum
 from space_dist.config import RunConfig, load
 from space_dist.curricula import Curriculum, RoundRobin, SetState, Space, variants
+from space_dist.curricula.making import make_curriculum
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
+from space_dist.run.building import make_setup, spec_of
+from space_dist.run.cluster import Central
 from tests.test_curricula import as_plain, drive, feedback, make_set, shown, stored_and_restored
 
 SPACE = Path(__file__).parent.parent / "configs" / "pointmass_space.yaml"

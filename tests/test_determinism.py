@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from space_dist import config as configs
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.patience import PATIENCE
 

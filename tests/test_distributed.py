@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
-from space_dist.building import make_setup, spec_of
 from space_dist.errors import SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, read_instances
 from space_dist.ledger import CURRICULUM, METRICS
-from space_dist.place import private_ray
+from space_dist.run.building import make_setup, spec_of
+from space_dist.run.launch import launch, read_instances
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.workplace import private_ray
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,7 +37,7 @@ def config(workers: int, *settings: str) -> configs.RunConfig:
 @pytest.fixture(scope="module")
 def cluster_class() -> Any:
     private_ray()
-    from space_dist.distributed import RayCluster
+    from space_dist.run.ray_cluster import RayCluster
 
     return RayCluster
 
@@ -97,7 +97,7 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
         raise Exception("The current node timed out during startup.\nThis could happen because")
 
     monkeypatch.setattr(ray, "init", never)
-    monkeypatch.setattr("space_dist.ray_watch.REACH_SECONDS", 1.0)
+    monkeypatch.setattr("space_dist.run.ray_watch.REACH_SECONDS", 1.0)
     up = "The current node timed out during startup."
     for address, starts, what in (
         ("local", 5, up),

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from space_dist import endings, errors
-from space_dist.endings import Busy, Cause, Ended, Evidence, Said, why_ended
-from space_dist.manifest import Retry
-from space_dist.standing import may_retry
+from space_dist import errors
+from space_dist.experiment import endings
+from space_dist.experiment.endings import Busy, Cause, Ended, Evidence, Said, why_ended
+from space_dist.experiment.manifest import Retry
+from space_dist.experiment.status import may_retry
 from tests.grids import ROOT
 
 DONE, ELSEWHERE = "none: it is done", "none: another process works on it"

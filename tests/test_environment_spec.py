@@ -24,9 +24,9 @@ from space_dist.envs import BatchedSingles, close, make_batched
 from space_dist.envs.interface import Closable, FloatArray, IntArray, Observations, Step
 from space_dist.envs.spec import read_spec
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
-from space_dist.planning import plan
+from space_dist.grid.planning import plan
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests.faulty_env import Honest
 from tests.grids import SMALL, write_grid, write_line_instances
 from tests.patience import PATIENCE

@@ -11,12 +11,12 @@ from sb3_contrib import TRPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from space_dist.building import spec_of
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, policy_of
 from space_dist.ledger import Ledger
-from space_dist.policy import members_of
+from space_dist.rollout.policy import members_of
+from space_dist.run.building import spec_of
+from space_dist.run.launch import launch, policy_of
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
+from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
 from tests.test_learners import DISCRETE_LINE, LINE, N_STEPS, PARTS, config_for, learner_section
 

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, stored_config
+from space_dist.experiment.manifest import Grid
+from space_dist.experiment.status import Attempts
 from space_dist.ledger import METRICS, Ledger
-from space_dist.manifest import Grid
-from space_dist.standing import Attempts
+from space_dist.run.launch import launch, stored_config
+from space_dist.system.interrupts import StopRequests
 from tests.grids import ROOT
 from tests.patience import PATIENCE
 

@@ -20,15 +20,15 @@ import psutil
 import pytest
 
 from space_dist import config as configs
-from space_dist import supervisor
-from space_dist.endings import Busy, Cause, Ended, Evidence
 from space_dist.errors import ConfigError, Interrupted, LedgerError
-from space_dist.grid import Conductor
+from space_dist.experiment.endings import Busy, Cause, Ended, Evidence
+from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, find_grid
+from space_dist.experiment.status import Attempts, concluded, exit_code, last_lines, settled, standing_of, standings
+from space_dist.grid import supervisor
+from space_dist.grid.conductor import Conductor
+from space_dist.grid.planning import plan
 from space_dist.ledger import METRICS, Lock, Row
-from space_dist.manifest import Grid, GridConfig, Manifest, Run, find_grid
-from space_dist.planning import plan
-from space_dist.provenance import source_digest
-from space_dist.standing import Attempts, concluded, exit_code, last_lines, settled, standing_of, standings
+from space_dist.system.provenance import source_digest
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
 from tests.test_report import continue_run, start_run
@@ -327,7 +327,7 @@ def test_a_supervisor_that_is_gone_leaves_a_killed_run(one: tuple[Grid, Manifest
     code = f"""
 from pathlib import Path
 from space_dist.ledger import Ledger
-from space_dist.standing import Attempts
+from space_dist.experiment.status import Attempts
 Attempts(Ledger({str(grid.ledger(run).folder)!r})).begin(1, {{}})
 """
     subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
@@ -371,11 +371,11 @@ def test_last_lines_of_anything(tmp_path: Path) -> None:
 
 
 class Supervised:
-    """`python -m space_dist.supervisor`, spoken to as a pool does."""
+    """`python -m space_dist.grid.supervisor`, spoken to as a pool does."""
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "space_dist.supervisor"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [sys.executable, "-m", "space_dist.grid.supervisor"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
         assert "ready" in self.read()
@@ -583,8 +583,8 @@ def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
     lonely.process.wait()
     assert attempts.history().abandoned
     assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "running"
-    monkeypatch.setattr("space_dist.grid._ABANDONED_SECONDS", 0.5)
-    monkeypatch.setattr("space_dist.grid._ELSEWHERE_SECONDS", 0.1)
+    monkeypatch.setattr("space_dist.grid.conductor._ABANDONED_SECONDS", 0.5)
+    monkeypatch.setattr("space_dist.grid.conductor._ELSEWHERE_SECONDS", 0.1)
     script, began = Script(grid, {}), time.monotonic()
     Conductor(grid, manifest, [run], script, stop_requested=lambda: None).conduct()
     assert script.started == [run.key]

@@ -16,13 +16,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, stored_config
+from space_dist.experiment.manifest import Grid, Run
+from space_dist.experiment.status import Attempts
+from space_dist.grid.planning import plan
 from space_dist.ledger import METRICS, this_process
-from space_dist.manifest import Grid, Run
-from space_dist.place import private_ray
-from space_dist.planning import plan
-from space_dist.standing import Attempts
+from space_dist.run.launch import launch, stored_config
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.workplace import private_ray
 from tests.grids import ROOT, write_grid
 
 sys.path.append(str(ROOT / "jobs"))
@@ -149,7 +149,7 @@ def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(
     private_ray()
     import ray
 
-    from space_dist.ray_jobs import _memory_of_a_place
+    from space_dist.grid.jobs import _memory_of_a_place
 
     manifest = plan(write_grid(tmp_path, resources={"workers": 1}), tmp_path / "runs").manifest
     gigabyte = 2.0**30
@@ -172,7 +172,7 @@ def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(
 
 def test_the_nonces_of_killed_conductors_go_with_the_next_ones(tmp_path: Path) -> None:
     private_ray()
-    from space_dist.ray_pool import Nonce, refuse_other_folder
+    from space_dist.grid.pool import Nonce, refuse_other_folder
 
     for name, content in (("torn", ""), ("elsewhere", json.dumps(this_process() | {"boot_id": "another"})),
                           ("dead", json.dumps(this_process() | {"started": 1})),

@@ -18,11 +18,12 @@ import pytest
 from scipy import stats
 
 from space_dist.cli import main
-from space_dist.endings import Cause, Ended
 from space_dist.errors import ConfigError
+from space_dist.experiment.endings import Cause, Ended
+from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
+from space_dist.experiment.status import Attempts
+from space_dist.grid.planning import plan
 from space_dist.ledger import Ledger, RunWriter
-from space_dist.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
-from space_dist.planning import plan
 from space_dist.report import build_grid_report
 from space_dist.report.document import Document, Section, escaped, to_html, to_markdown
 from space_dist.report.grid import compare, heat_maps, pool, read_cells
@@ -40,7 +41,6 @@ from space_dist.report.statistics import (
     stratified,
 )
 from space_dist.seeding import Purpose, generator
-from space_dist.standing import Attempts
 from tests.grids import SMALL, write_grid
 from tests.test_report import GROWTH, continue_run, start_run
 

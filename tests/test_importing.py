@@ -15,7 +15,7 @@ import pytest
 from gymnasium.envs.classic_control import CartPoleEnv  # noqa: F401 - likewise, and allowed
 
 from space_dist.errors import ConfigError
-from space_dist.importing import folders_of_user, load, look_in, why_refused
+from space_dist.system.importing import folders_of_user, load, look_in, why_refused
 from tests.commanding import command
 from tests.patience import PATIENCE
 

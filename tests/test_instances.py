@@ -14,18 +14,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from space_dist import instances as module
+from space_dist.envs import distributions as module
+from space_dist.envs.distributions import DISTRIBUTIONS, sample
+from space_dist.envs.pointmass import BOUNDS as POINTMASS_BOUNDS
 from space_dist.errors import ConfigError
 from space_dist.instances import (
-    DISTRIBUTIONS,
     MAX_FILE_BYTES,
     MAX_LINE_BYTES,
-    POINTMASS_BOUNDS,
     ContextBounds,
     InstanceSet,
     read_csv,
     refuse_overlap,
-    sample,
     summary,
 )
 

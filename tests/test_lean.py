@@ -16,15 +16,15 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from space_dist import config as configs
-from space_dist.building import resolved, spec_of
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
-from space_dist.interrupts import StopRequests
 from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
-from space_dist.launch import launch
 from space_dist.learner import lean, make_learner
 from space_dist.learner.lean import LeanBuffer
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
-from space_dist.training import Progress
+from space_dist.run.building import resolved, spec_of
+from space_dist.run.launch import launch
+from space_dist.run.training import Progress
+from space_dist.system.interrupts import StopRequests
 from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
 
 UPDATES = 20

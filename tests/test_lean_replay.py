@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from space_dist import config as configs
 from space_dist import learner as learners
-from space_dist.building import resolved, spec_of
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.learner import lean_replay, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
+from space_dist.run.building import resolved, spec_of
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests.test_lean import Casting, assert_resumed_to_the_same_bytes, close
 from tests.test_off_policy import CONFIGS, KINDS, ROUND, SEED, STEPS, Stream, action_space, learn, rounds_of, stream_for
 

@@ -20,12 +20,12 @@ from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig
 from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, make_batched
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.learner import Learner, OnPolicyLearner, make_learner
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Episodes, Rollout, Shard, Stage, collect
-from space_dist.walk import Unfinished
+from space_dist.rollout.walk import Unfinished
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 
 POINTMASS, LINE, DISCRETE_LINE = "space_dist/PointMass-v0", "tests.tiny_env:make", "tests.tiny_env:make_discrete"
 SLOTS, LENGTH = 3, 16  # per shard, where nothing else is said

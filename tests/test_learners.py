@@ -14,21 +14,21 @@ from gymnasium import spaces
 from stable_baselines3.sac.policies import SACPolicy  # noqa: F401 - named by import path
 
 from space_dist import config as configs
-from space_dist.building import learner_of, make_setup, spec_of
-from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig
+from space_dist.curricula.making import make_curriculum
 from space_dist.envs.observations import Observations, rows
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, policy_of, read_instances
 from space_dist.learner import make_learner
 from space_dist.learner.networks import TorchPolicy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.ledger import CURRICULUM, FORMAT, METRICS, Ledger, RunWriter, decode_checkpoint
-from space_dist.policy import MlpPolicy
 from space_dist.report import build_report, load_run
 from space_dist.rollout import Worker
-from space_dist.walk import Walk
+from space_dist.rollout.policy import MlpPolicy
+from space_dist.rollout.walk import Walk
+from space_dist.run.building import learner_of, make_setup, spec_of
+from space_dist.run.launch import launch, policy_of, read_instances
+from space_dist.system.interrupts import StopRequests
 from tests.test_learner import hand_made
 
 LINE, DISCRETE_LINE, SCALED = "tests.tiny_env:make", "tests.tiny_env:make_discrete", "tests.tiny_env:make_scaled"

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from space_dist import cli
 from space_dist.cli import runs
 from space_dist.envs import BatchedMaze, ContextObservation, ContextVisible
-from space_dist.instances import MAZE_BOUNDS, InstanceSet, read_csv, refuse_overlap, sample
-from space_dist.interrupts import StopRequests
-from space_dist.mazes import carve, shortest_ways, symmetrised
+from space_dist.envs.distributions import sample
+from space_dist.envs.layouts import carve, shortest_ways, symmetrised
+from space_dist.envs.maze import BOUNDS as MAZE_BOUNDS
+from space_dist.instances import InstanceSet, read_csv, refuse_overlap
+from space_dist.system.interrupts import StopRequests
 
 ENV_ID = "space_dist/Maze-v0"
 INSTANCES = Path(__file__).parent.parent / "configs" / "instances"
@@ -225,8 +227,8 @@ def test_half_a_wall_is_refused() -> None:
 
 WALK = """
 import gymnasium, numpy, space_dist.envs
-from space_dist.interrupts import StopRequests
-from space_dist.mazes import carve
+from space_dist.system.interrupts import StopRequests
+from space_dist.envs.layouts import carve
 env = gymnasium.make("space_dist/Maze-v0")
 env.reset(seed=5, options={"context": carve(numpy.random.default_rng(7), 1)[0]})
 print([env.step(int(action))[0].tolist() for action in numpy.random.default_rng(8).integers(4, size=60)])

@@ -21,10 +21,10 @@ from space_dist.config import DQNConfig, SACConfig, TD3Config
 from space_dist.curricula import Selection
 from space_dist.learner import OffPolicyLearner, make_learner
 from space_dist.learner.interface import _seeded
-from space_dist.policy import Exploration, Head, MlpPolicy, Noise
 from space_dist.rollout import Setup, Shard, Worker
+from space_dist.rollout.policy import Exploration, Head, MlpPolicy, Noise
+from space_dist.rollout.walk import Walk
 from space_dist.seeding import Purpose, generator
-from space_dist.walk import Walk
 from tests.test_learner import bits, hand_made
 from tests.test_rollout import setup_for
 

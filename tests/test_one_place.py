@@ -13,13 +13,13 @@ from typing import Any
 import psutil
 import pytest
 
-from space_dist import warm
-from space_dist.endings import Cause, Ended
+from space_dist.experiment.endings import Cause, Ended
+from space_dist.experiment.manifest import Grid
+from space_dist.experiment.status import Attempts
+from space_dist.grid import warm
+from space_dist.grid.planning import plan
+from space_dist.grid.warm import OnePlace, memory_of_a_core, one_place_is_enough
 from space_dist.ledger import METRICS, Row
-from space_dist.manifest import Grid
-from space_dist.planning import plan
-from space_dist.standing import Attempts
-from space_dist.warm import OnePlace, memory_of_a_core, one_place_is_enough
 from tests import prepared
 from tests.grids import TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
@@ -89,7 +89,7 @@ def under_way(gate: Path, tmp_path: Path) -> Iterator[tuple[BaseProcess, psutil.
     try:
         await_(begun, "the first run to be under way")
         [supervisor] = [child for child in psutil.Process(conductor.pid).children()
-                        if "space_dist.supervisor" in child.cmdline()]  # fmt: skip
+                        if "space_dist.grid.supervisor" in child.cmdline()]  # fmt: skip
         yield conductor, supervisor, grid
     finally:
         conductor.kill()
@@ -143,7 +143,9 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
         place.start([(run, 1)])
         assert place.room() == 0
         await_(lambda: Attempts(made.grid.ledger(run)).history().begun == 1, "the attempt to begin")
-        [supervisor] = [child for child in psutil.Process().children() if "space_dist.supervisor" in child.cmdline()]
+        [supervisor] = [
+            child for child in psutil.Process().children() if "space_dist.grid.supervisor" in child.cmdline()
+        ]
         supervisor.suspend()
         await_(lambda: bool(found.extend(place.poll()) or found), "the attempt to end")
         gate.unlink()

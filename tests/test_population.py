@@ -14,19 +14,19 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist import rollout
-from space_dist.building import learner_of, make_setup, memory_of, spec_of
-from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
+from space_dist.curricula.making import make_curriculum
 from space_dist.envs.interface import Step
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import Outcome, launch, policy_of, read_instances
 from space_dist.learner import CoupledLearner
 from space_dist.ledger import CURRICULUM, Ledger
-from space_dist.policy import members_of
-from space_dist.population import advance, member
 from space_dist.rollout import Shard, Worker
-from space_dist.walk import Walk
+from space_dist.rollout.policy import members_of
+from space_dist.rollout.walk import Walk
+from space_dist.run.building import learner_of, make_setup, memory_of, spec_of
+from space_dist.run.launch import Outcome, launch, policy_of, read_instances
+from space_dist.run.population import advance, member
+from space_dist.system.interrupts import StopRequests
 from tests.grids import ROOT
 from tests.test_learners import LINE, N_STEPS, ROUNDS, config_for, crashed, learner_section, results
 from tests.tiny_env import Line

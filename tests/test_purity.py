@@ -30,7 +30,7 @@ def test_importing_it_imports_nothing_heavy(module: str):
     assert not imported.intersection(HEAVY)
 
 
-@pytest.mark.parametrize("module", ["space_dist.ray_jobs", "space_dist.supervisor", "space_dist.slurm"])
+@pytest.mark.parametrize("module", ["space_dist.grid.jobs", "space_dist.grid.supervisor", "space_dist.slurm"])
 def test_whoever_only_starts_runs_does_not_wait_for_torch(module: str):
     assert not imported_with(module).intersection({"torch", "mlflow", "stable_baselines3", "sb3_contrib"})
 

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
 from space_dist import config as configs
-from space_dist.building import learner_of, make_setup, spec_of
 from space_dist.envs import make_batched
+from space_dist.envs.layouts import carve
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
-from space_dist.launch import policy_of
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, RunWriter, Status
-from space_dist.mazes import carve
-from space_dist.policy import MlpPolicy, to_arrays
-from space_dist.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.rollout import Worker
+from space_dist.rollout.policy import MlpPolicy, to_arrays
+from space_dist.run.building import learner_of, make_setup, spec_of
+from space_dist.run.launch import policy_of
+from space_dist.run.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.tracking import runs, sync
 from tests.commanding import command
 from tests.test_report import finished_run, written

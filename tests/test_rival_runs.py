@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from space_dist import config as configs
+from space_dist.envs.distributions import sample
 from space_dist.errors import Interrupted
-from space_dist.instances import sample
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.learner import Ensemble
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
 from space_dist.report import draw_curriculum, load_run
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")

@@ -20,8 +20,6 @@ from scipy import stats
 from sklearn.mixture import GaussianMixture
 
 from space_dist import config as configs
-from space_dist.building import make_setup, spec_of
-from space_dist.cluster import make_curriculum
 from space_dist.curricula import (
     Curriculum,
     Draws,
@@ -37,20 +35,22 @@ from space_dist.curricula.alp_gmm import AlpGmm, MixtureState, absolute_progress
 from space_dist.curricula.configured import Makers
 from space_dist.curricula.draws import effective_size, proportional
 from space_dist.curricula.learnability import Learnability, learnable_chances
+from space_dist.curricula.making import make_curriculum
 from space_dist.curricula.plr import LevelReplay, ReplayState, replay_chances, replayed
 from space_dist.curricula.vds import ValueDisagreement, disagreement
 from space_dist.envs import make_batched
-from space_dist.episodes import mean_sizes
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.learner import Ensemble, make_learner
-from space_dist.policy import EnsemblePolicy, Statistics
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout import Setup, Shard, Worker
+from space_dist.rollout.episodes import mean_sizes
+from space_dist.rollout.policy import EnsemblePolicy, Statistics
+from space_dist.rollout.walk import Walk
+from space_dist.run.building import make_setup, spec_of
+from space_dist.run.launch import launch
 from space_dist.seeding import Purpose, generator
-from space_dist.walk import Walk
+from space_dist.system.interrupts import StopRequests
 from tests.tiny_env import Line
 
 ROOT = Path(__file__).resolve().parent.parent

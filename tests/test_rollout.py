@@ -22,7 +22,6 @@ from space_dist.envs.spec import read_spec
 from space_dist.errors import SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.learner import make_learner
-from space_dist.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
 from space_dist.rollout import (
     CHUNK,
     Outcomes,
@@ -36,8 +35,9 @@ from space_dist.rollout import (
     evaluate,
     joined,
 )
+from space_dist.rollout.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
+from space_dist.rollout.walk import Walk
 from space_dist.seeding import Purpose, episode_seeds, generator
-from space_dist.walk import Walk
 from tests import tiny_env
 
 POINTMASS = "space_dist/PointMass-v0"

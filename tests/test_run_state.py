@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from space_dist.curricula import Episodes
-from space_dist.episodes import joined_episodes
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
-from space_dist.run_state import RunState
-from space_dist.walk import Unfinished, Walk
+from space_dist.rollout.episodes import joined_episodes
+from space_dist.rollout.walk import Unfinished, Walk
+from space_dist.run.state import RunState
 from tests.test_learners import config_for, interrupted, learner_section
 from tests.test_rollout import setup_for
 

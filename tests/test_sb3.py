@@ -32,20 +32,20 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from space_dist import config as configs
 from space_dist.arithmetic import SETTINGS
-from space_dist.building import learner_of, spec_of
-from space_dist.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.config import RunConfig
 from space_dist.curricula import Selection
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.interrupts import StopRequests
-from space_dist.launch import begun
 from space_dist.learner import SB3Learner
 from space_dist.ledger import Checkpoint, decode_checkpoint
 from space_dist.rollout import Outcomes, Shard
+from space_dist.run.building import learner_of, spec_of
+from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
+from space_dist.run.launch import begun
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
 from space_dist.sb3.callback import STATE
 from space_dist.sb3.script import Scored, Wrapped
+from space_dist.system.interrupts import StopRequests
 from tests.faulty_env import Honest
 from tests.patience import PATIENCE
 from tests.test_learners import LEARNERS, OFF_POLICY

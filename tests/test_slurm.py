@@ -18,17 +18,17 @@ from typing import Any
 import pytest
 
 from space_dist import cli
-from space_dist.endings import Cause, Ended
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
-from space_dist.grid import Conductor, adopt, working_on
-from space_dist.manifest import Grid, Manifest, Run
-from space_dist.planning import plan
+from space_dist.experiment.endings import Cause, Ended
+from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.experiment.status import slurm_job, unheard
+from space_dist.grid.conductor import Conductor, adopt, working_on
+from space_dist.grid.planning import plan
 from space_dist.slurm import Export, Mode, Profile, export, load_profile
 from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN, render
 from space_dist.slurm.node import address_facing
 from space_dist.slurm.profile import seconds
 from space_dist.slurm.queue import queue_of
-from space_dist.standing import slurm_job, unheard
 from tests.patience import PATIENCE
 from tests.slurm.profiles import exports
 

@@ -21,12 +21,12 @@ from pathlib import Path
 import pytest
 
 from space_dist.config import to_yaml
+from space_dist.experiment.manifest import Grid
+from space_dist.experiment.status import Attempts
 from space_dist.ledger import METRICS, Ledger
-from space_dist.manifest import Grid
 from space_dist.slurm import Export, Profile
 from space_dist.slurm import export as write_scripts
 from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
-from space_dist.standing import Attempts
 from tests.patience import PATIENCE
 from tests.slurm.gated_env import GATE
 from tests.slurm.profiles import FIELDS, RESERVATION, exports

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from space_dist.envs import make_batched
+from space_dist.envs.pointmass import BOUNDS as POINTMASS_BOUNDS
 from space_dist.envs.pointmass import START, BatchedPointMass
 from space_dist.errors import SpaceDistError
-from space_dist.instances import POINTMASS_BOUNDS
 from tests.grids import ROOT
 
 sys.path.append(str(ROOT / "jobs"))

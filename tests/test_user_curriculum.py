@@ -15,13 +15,13 @@ import pytest
 
 from space_dist import cli
 from space_dist import config as configs
-from space_dist.building import make_setup, spec_of
 from space_dist.cli import runs
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, read_instances
+from space_dist.grid.planning import plan
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, RunWriter
-from space_dist.planning import plan
+from space_dist.run.building import make_setup, spec_of
+from space_dist.run.launch import launch, read_instances
+from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.patience import PATIENCE
 from tests.test_learners import interrupted

@@ -15,10 +15,11 @@ from gymnasium.wrappers import TimeLimit, TransformReward
 
 from space_dist.cli import runs
 from space_dist.envs import BatchedEnv, BatchedSingles, make_batched
+from space_dist.envs.cartpole import BOUNDS as CARTPOLE_BOUNDS
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.instances import CARTPOLE_BOUNDS, read_csv
-from space_dist.interrupts import StopRequests
+from space_dist.instances import read_csv
 from space_dist.ledger import Ledger
+from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
 from tests.faulty_env import HORIZON, Honest
 

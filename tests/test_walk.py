@@ -28,8 +28,8 @@ from space_dist.instances import InstanceSet
 from space_dist.learner import make_learner
 from space_dist.learner.normaliser import _discounted
 from space_dist.rollout import Rollout, Setup, Shard, Stage, Worker, collect
+from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.seeding import Purpose, generator
-from space_dist.walk import Unfinished, Walk, stacked, unstacked
 from tests.test_learner import Ignore
 from tests.test_rollout import Countdown, bits, falling, setup_for, uniform, weights_for
 from tests.tiny_env import Line

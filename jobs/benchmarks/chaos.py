@@ -40,9 +40,9 @@ from rich.table import Table
 from benchmarks.servers import RayHead, TrackingServer, until
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError, nearest
+from space_dist.experiment.manifest import Grid, Run
+from space_dist.experiment.status import Attempts, standing_of
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, Status
-from space_dist.manifest import Grid, Run
-from space_dist.standing import Attempts, standing_of
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPARED = (METRICS, CURRICULUM, "model.npz")
@@ -419,7 +419,7 @@ class _Rehearsal:
             status = self._status(run)
             if status is not None and status.state == "running" and 0 < status.steps < status.budget_steps:
                 driver = self._driver(self._grid.ledger(run))
-                if driver is None or not _is(driver, "space_dist.supervisor"):
+                if driver is None or not _is(driver, "space_dist.grid.supervisor"):
                     continue
                 if status.round > self._first_seen.setdefault((run.key, driver), status.round):
                     found.append(_Live(run, status.round, driver))
@@ -488,7 +488,7 @@ class _Rehearsal:
     ) -> tuple[list[psutil.Process], Sequence[_Live], Callable[[], None] | None]:
         """The processes to hit, the runs that go on in another process then, and what has to be restarted."""
         driver, supervisor, sharing = chosen.driver, chosen.driver.parent(), _sharing(chosen, live)
-        if supervisor is None or not _is(supervisor, "space_dist.supervisor"):
+        if supervisor is None or not _is(supervisor, "space_dist.grid.supervisor"):
             raise _Missed
         if name.endswith("actor"):
             kind = {"rollout actor": "RolloutActor", "curriculum actor": "CurriculumActor"}[name]

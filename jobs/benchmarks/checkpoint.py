@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from space_dist import config as configs
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 
 ROOT = Path(__file__).resolve().parents[2]
 console = Console()
@@ -72,7 +72,7 @@ def checkpoint(
 
 def _seconds(name: str, settings: list[str]) -> tuple[float, int, float]:
     """Wall seconds of a run, its commits, and the wall seconds that they took, encoding included."""
-    from space_dist.training import Training, Work
+    from space_dist.run.training import Training, Work
 
     spent: list[float] = []
     commit = Training._commit

@@ -190,10 +190,10 @@ def measure(task: Task, contender: Contender, seconds: float, clock: Callable[[]
 
 def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     from space_dist.errors import Interrupted
-    from space_dist.interrupts import StopRequests
-    from space_dist.launch import launch
     from space_dist.ledger import Ledger
-    from space_dist.training import Progress
+    from space_dist.run.launch import launch
+    from space_dist.run.training import Progress
+    from space_dist.system.interrupts import StopRequests
 
     slots = [f"rollout.slots={contender.slots}"] if contender.slots else []
     config = task.run_config(
@@ -222,9 +222,9 @@ class _Measured(Exception):  # noqa: N818 - no error
 
 def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     """Runs side by side in this process, marked where the last of them has collected."""
-    from space_dist.interrupts import StopRequests
-    from space_dist.population import advance, member
-    from space_dist.training import Learn
+    from space_dist.run.population import advance, member
+    from space_dist.run.training import Learn
+    from space_dist.system.interrupts import StopRequests
 
     def watched(work: Any) -> Iterator[Any]:
         answer: Any = None
@@ -339,7 +339,7 @@ def _contexts(config: configs.RunConfig, bounds: ContextBounds) -> NDArray[np.fl
 
 
 def _rllib(task: Task, contender: Contender, watch: _Stopwatch) -> None:
-    from space_dist.place import private_ray
+    from space_dist.system.workplace import private_ray
 
     private_ray()
     import ray

@@ -19,12 +19,13 @@ from threadpoolctl import threadpool_limits
 from benchmarks.curriculum import ppo_update_seconds
 from benchmarks.measure import duration
 from space_dist import config as configs
-from space_dist.building import make_setup, spec_of
-from space_dist.cluster import Decision, Evidence, Handle, InProcess
-from space_dist.instances import InstanceSet, sample
+from space_dist.envs.distributions import sample
+from space_dist.instances import InstanceSet
 from space_dist.ledger import Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray
-from space_dist.training import Training
+from space_dist.run.building import make_setup, spec_of
+from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
+from space_dist.run.training import Training
 
 ROOT = Path(__file__).resolve().parents[2]
 console = Console()

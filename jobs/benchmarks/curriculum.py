@@ -15,12 +15,12 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import duration, median, median_cpu
 from space_dist import config as configs
-from space_dist.building import learner_of, make_setup, spec_of
-from space_dist.cluster import Central, Evidence, InProcess
 from space_dist.curricula import SetState
-from space_dist.instances import sample
-from space_dist.place import private_ray
-from space_dist.walk import Walk
+from space_dist.envs.distributions import sample
+from space_dist.rollout.walk import Walk
+from space_dist.run.building import learner_of, make_setup, spec_of
+from space_dist.run.cluster import Central, Evidence, InProcess
+from space_dist.system.workplace import private_ray
 
 ROOT = Path(__file__).resolve().parents[2]
 console = Console()
@@ -98,7 +98,7 @@ def _curriculum_row(config: configs.RunConfig, n_instances: int, repeats: int) -
 
 def _through_ray(config: configs.RunConfig, setup: Any, state: Any, before: Any, repeats: int) -> float:
     """Median wall seconds of one decision through actors: weights out, values across, decision made."""
-    from space_dist.distributed import RayCluster
+    from space_dist.run.ray_cluster import RayCluster
 
     local = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 1})})
     weights = learner_of(config, setup.spec).policy(0)

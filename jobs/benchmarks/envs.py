@@ -21,7 +21,7 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from space_dist.envs import make_batched, pointmass
-from space_dist.instances import sample
+from space_dist.envs.distributions import sample
 
 console = Console()
 

@@ -28,7 +28,7 @@ from scipy import stats
 
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
-from space_dist.manifest import Grid
+from space_dist.experiment.manifest import Grid
 
 ROOT = Path(__file__).resolve().parents[2]
 MARGIN = 0.05  # share of the pilot's mean return

@@ -31,7 +31,7 @@ from space_dist.envs.pointmass import (
     REWARD_DECAY,
     START,
 )
-from space_dist.instances import POINTMASS_BOUNDS
+from space_dist.envs.pointmass import BOUNDS as POINTMASS_BOUNDS
 
 Array = Any  # JAX's, whatever is being traced
 _INPUTS, _OUTPUTS = len(START) + len(POINTMASS_BOUNDS.names), 2

@@ -18,11 +18,11 @@ from rich.table import Table
 from stable_baselines3 import DQN, SAC, TD3
 
 from space_dist import config as configs
-from space_dist.interrupts import StopRequests
 from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
 from space_dist.kernels.ppo import TOLD
-from space_dist.launch import launch
 from space_dist.learner.lean_replay import LEAN
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 
 CONFIGS = Path(__file__).resolve().parent.parent.parent / "configs"
 COMMON = ["tracking.uri=null", "resources.workers=0"]

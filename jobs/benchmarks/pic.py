@@ -25,12 +25,12 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from space_dist import config as configs
-from space_dist.building import make_setup, spec_of
-from space_dist.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.instances import read_csv
 from space_dist.ledger import METRICS, Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray, IntArray, Split, joined
-from space_dist.training import Training
+from space_dist.run.building import make_setup, spec_of
+from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
+from space_dist.run.training import Training
 
 ROOT = Path(__file__).resolve().parents[2]
 RANKS = ("improvement", "abs", "relative", "lowest_value", "random")

@@ -17,7 +17,7 @@ from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
 from space_dist.cli.worlds import env_app, render
 from space_dist.errors import SpaceDistError
-from space_dist.importing import look_here_too
+from space_dist.system.importing import look_here_too
 
 app = typer.Typer(
     name="space-dist", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,

@@ -18,16 +18,16 @@ from rich.text import Text
 
 from space_dist.cli.terminal import STOP, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.files import LogFile
+from space_dist.system.files import LogFile
 
 if TYPE_CHECKING:
     from ray.job_submission import JobDetails
 
-    from space_dist.grid import Overview
-    from space_dist.manifest import Grid, Manifest, Run
-    from space_dist.ray_jobs import Mode, Remote
+    from space_dist.experiment.manifest import Grid, Manifest, Run
+    from space_dist.experiment.status import Standing
+    from space_dist.grid.conductor import Overview
+    from space_dist.grid.jobs import Mode, Remote
     from space_dist.slurm.queue import Queue
-    from space_dist.standing import Standing
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
 
@@ -56,9 +56,9 @@ _UNFINISHED = 3
 @grid_app.command("plan")
 def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
     """Check a grid, print its cells and what is done already, and freeze its manifest."""
-    from space_dist.planning import plan
-    from space_dist.provenance import code_digest
-    from space_dist.standing import standings
+    from space_dist.experiment.status import standings
+    from space_dist.grid.planning import plan
+    from space_dist.system.provenance import code_digest
 
     made = plan(grid, _root(root))
     manifest = made.manifest
@@ -152,7 +152,7 @@ def grid_submit(
 ) -> None:
     """Submit a grid to a Ray cluster. Submitted twice, it still runs once."""
     STOP.install()
-    from space_dist.ray_jobs import Remote
+    from space_dist.grid.jobs import Remote
 
     chosen = _mode(mode)
     limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
@@ -185,8 +185,8 @@ def grid_status(
     address: JobServer = None,
 ) -> None:
     """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
+    from space_dist.experiment.status import exit_code
     from space_dist.slurm.queue import queue_of
-    from space_dist.standing import exit_code
 
     place, manifest = _found(grid, root)
     if address is not None:
@@ -218,7 +218,7 @@ def grid_logs(
     follow: Annotated[bool, typer.Option("--follow", help="Go on until the run has ended.")] = False,
 ) -> None:
     """What one run has said."""
-    from space_dist.supervisor import OUTPUT
+    from space_dist.grid.supervisor import OUTPUT
 
     place, manifest = _found(grid, root)
     run = manifest.run(cell, seed)
@@ -271,8 +271,8 @@ def grid_retry(
     root: Root = None,
 ) -> None:
     """Let failed runs be tried again, whatever the grid's `retry` says; they go on from their checkpoints."""
-    from space_dist.endings import Cause
-    from space_dist.standing import Attempts
+    from space_dist.experiment.endings import Cause
+    from space_dist.experiment.status import Attempts
 
     known = [one.value for one in Cause]
     causes = {name.strip().replace("-", "_") for text in cause for name in text.split(",")}
@@ -297,10 +297,10 @@ def grid_work(
 ) -> None:
     """One attempt of one run, or of several side by side, as a job of its own."""
     STOP.install()
-    from space_dist.endings import AskedBy, Cause
-    from space_dist.place import lasting
-    from space_dist.ray_pool import refuse_other_folder
-    from space_dist.supervisor import Supervisor, Task, Turn, preload
+    from space_dist.experiment.endings import AskedBy, Cause
+    from space_dist.grid.pool import refuse_other_folder
+    from space_dist.grid.supervisor import Supervisor, Task, Turn, preload
+    from space_dist.system.workplace import lasting
 
     refuse_other_folder(lasting(folder, "the grid's folder"), nonce)
     preload()
@@ -327,8 +327,8 @@ def run_frozen(
 ) -> list[Standing]:  # fmt: skip
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
     _prepare(address)
-    from space_dist.grid import Conductor, working_on
-    from space_dist.warm import OnePlace, one_place_is_enough
+    from space_dist.grid.conductor import Conductor, working_on
+    from space_dist.grid.warm import OnePlace, one_place_is_enough
 
     runs = _part(manifest.runs(), part)
     _log_to(place)
@@ -341,7 +341,7 @@ def run_frozen(
             return Conductor(
                 place, manifest, runs, here, stop_requested=STOP.reason, observe=observe
             ).conduct()  # fmt: skip
-        from space_dist.ray_jobs import conduct
+        from space_dist.grid.jobs import conduct
 
         return conduct(
             place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
@@ -356,27 +356,27 @@ def _prepare(address: str) -> None:
     """What must come before Ray, and anything else that is heavy, is imported."""
     STOP.install()
     if address == "local":
-        from space_dist.place import private_ray
+        from space_dist.system.workplace import private_ray
 
         private_ray()
 
 
 def _root(root: Path | None) -> Path:
-    from space_dist.place import lasting, workplace
+    from space_dist.system.workplace import lasting, workplace
 
     return workplace() / "runs" if root is None else lasting(root, "--root")
 
 
 def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
     """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
-    from space_dist.grid import adopt
-    from space_dist.manifest import MANIFEST, find_grid
+    from space_dist.experiment.manifest import MANIFEST, find_grid
+    from space_dist.grid.conductor import adopt
 
     if path.is_dir() or path.name == MANIFEST:
         source = find_grid(path, root)
         place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
         return place, place.manifest()
-    from space_dist.planning import plan  # imports torch, to see whether every cell can learn
+    from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
 
     made = plan(path, root)
     return made.grid, made.manifest
@@ -384,7 +384,7 @@ def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
 
 def _found(path: Path, root: Path | None) -> tuple[Grid, Manifest]:
     """A grid that was frozen before, however the user names it."""
-    from space_dist.manifest import find_grid
+    from space_dist.experiment.manifest import find_grid
 
     place = find_grid(path, _root(root))
     return place, place.manifest()
@@ -412,8 +412,8 @@ def _part(runs: list[Run], part: str | None) -> list[Run]:
 
 
 def _standings(place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None) -> list[Standing]:
-    from space_dist.provenance import code_digest
-    from space_dist.standing import standings
+    from space_dist.experiment.status import standings
+    from space_dist.system.provenance import code_digest
 
     return standings(place, manifest, code_digest(), runs)
 
@@ -535,7 +535,7 @@ def _workers_in_words(place: Grid, queue: Queue | None) -> str:
 
 def tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
     """Say how a grid ended; returns the exit code."""
-    from space_dist.standing import exit_code
+    from space_dist.experiment.status import exit_code
 
     _print_failures(found, by_cause=False)
     say(f"{_summary(manifest, found)}. {place.folder}")
@@ -560,7 +560,7 @@ def _status_json(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> 
 
 def _conductor(place: Grid, manifest: Manifest, address: str) -> tuple[Remote, JobDetails]:
     """The job that conducts a grid on the cluster at `address`. Raises SpaceDistError if there was none."""
-    from space_dist.ray_jobs import Remote
+    from space_dist.grid.jobs import Remote
 
     remote = Remote(address, manifest, place.folder.parent)
     conductor = remote.conductor()

@@ -31,7 +31,7 @@ def instances_sample(
 ) -> None:
     """Draw disjoint training and test instances."""
     from space_dist.envs import distribution_of
-    from space_dist.instances import DISTRIBUTIONS, sample
+    from space_dist.envs.distributions import DISTRIBUTIONS, sample
 
     if (distribution == "uniform") != (env is not None):
         raise ConfigError("`instances sample uniform` needs --env, and no other distribution takes it")
@@ -96,8 +96,8 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
-    from space_dist.building import make_setup, spec_of
-    from space_dist.launch import read_instances
+    from space_dist.run.building import make_setup, spec_of
+    from space_dist.run.launch import read_instances
 
     run = configs.load(config, list(overrides or []))
     with about(str(config)):

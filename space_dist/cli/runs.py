@@ -17,9 +17,9 @@ from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, s
 from space_dist.errors import ConfigError, about, exits_refused
 
 if TYPE_CHECKING:
-    from space_dist.manifest import Grid
+    from space_dist.experiment.manifest import Grid
     from space_dist.report import GridReport, Report
-    from space_dist.training import Progress
+    from space_dist.run.training import Progress
 
 _REPORT_WIDTH = 200  # characters
 _GRID_WIDTH = 150
@@ -44,14 +44,14 @@ def train(
     """Train one policy under one curriculum."""
     STOP.install()
     from space_dist import config as configs
-    from space_dist.launch import launch
-    from space_dist.place import default_folder, lasting
+    from space_dist.run.launch import launch
+    from space_dist.system.workplace import default_folder, lasting
 
     settings = list(overrides or [])
     if workers is not None:
         settings.append(f"resources.workers={workers}")
     run = configs.load(config, settings, seed=seed)
-    folder = lasting(out, "--out") if out is not None else default_folder(run)
+    folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
     with about(str(config)), _display(run.name, run.seed) as observe:
         outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe)
     status = outcome.ledger.status()
@@ -73,14 +73,14 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
-    from space_dist.building import spec_of
     from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
-    from space_dist.launch import policy_of, stored_config
     from space_dist.ledger import Ledger
-    from space_dist.policy import members_of
     from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
+    from space_dist.rollout.policy import members_of
+    from space_dist.run.building import spec_of
+    from space_dist.run.launch import policy_of, stored_config
     from space_dist.seeding import Purpose, episode_seeds
 
     ledger = Ledger(run)
@@ -130,11 +130,11 @@ def explain(
     iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
 ) -> None:
     """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 12)."""
-    from space_dist.building import spec_of
     from space_dist.instances import read_csv
-    from space_dist.launch import stored_config
     from space_dist.ledger import Ledger
     from space_dist.report.decisions import explain as explain_decision
+    from space_dist.run.building import spec_of
+    from space_dist.run.launch import stored_config
 
     ledger = Ledger(run)
     ledger.status()
@@ -155,9 +155,9 @@ def export_sb3(
     ] = None,
 ) -> None:
     """Write a run's policy as a zip that Stable-Baselines3 loads."""
-    from space_dist.export import export_sb3 as export
-    from space_dist.launch import stored_config
     from space_dist.ledger import Ledger
+    from space_dist.run.launch import stored_config
+    from space_dist.sb3.export import export_sb3 as export
 
     ledger = Ledger(run)
     ledger.status()
@@ -204,14 +204,14 @@ def report(
 
 
 def _is_grid(path: Path) -> bool:
-    from space_dist.manifest import MANIFEST
+    from space_dist.experiment.manifest import MANIFEST
 
     return (path / MANIFEST).is_file() or (not path.is_dir() and (path.name == MANIFEST or path.suffix in _YAML))
 
 
 def _grid(path: Path, root: Path | None) -> Grid:
-    from space_dist.manifest import find_grid
-    from space_dist.place import workplace
+    from space_dist.experiment.manifest import find_grid
+    from space_dist.system.workplace import workplace
 
     return find_grid(path, workplace() / "runs" if root is None else root)
 
@@ -277,7 +277,7 @@ def sync(
     root: Annotated[Path, typer.Option(help="Where the grids of YAML files are.")] = Path("runs"),
 ) -> None:
     """Replay runs and grids into MLflow. Doing it twice changes nothing."""
-    from space_dist.manifest import find_grid
+    from space_dist.experiment.manifest import find_grid
     from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs

@@ -16,7 +16,7 @@ from space_dist.cli.terminal import one_of, say, warn
 from space_dist.errors import ConfigError, SpaceDistError
 
 if TYPE_CHECKING:
-    from space_dist.manifest import Manifest
+    from space_dist.experiment.manifest import Manifest
     from space_dist.slurm import Mode
 
 slurm_app = typer.Typer(no_args_is_help=True, help="The same grid as SLURM scripts.")
@@ -122,8 +122,8 @@ def _frozen(path: Path) -> tuple[Manifest, Mapping[str, bytes]]:
     """A grid that is frozen already, or frozen now from its YAML file, with its instance files."""
     import tempfile
 
-    from space_dist.manifest import MANIFEST, find_grid
-    from space_dist.planning import plan
+    from space_dist.experiment.manifest import MANIFEST, find_grid
+    from space_dist.grid.planning import plan
 
     with contextlib.ExitStack() as stack:
         if path.is_dir() or path.name == MANIFEST:

@@ -91,7 +91,7 @@ def delivered() -> None:
         raise SpaceDistError(f"standard output cannot be written: {lost.strerror}")
 
 
-from space_dist.interrupts import StopRequests
+from space_dist.system.interrupts import StopRequests
 
 STOP = StopRequests()
 

@@ -49,7 +49,7 @@ def render(
 ) -> None:
     """Draw what a run's policy does: a GIF for each instance, and trajectories side by side."""
     from space_dist.ledger import Ledger
-    from space_dist.render import draw_run
+    from space_dist.run.render import draw_run
 
     ids = None
     if instances is not None:

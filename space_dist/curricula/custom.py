@@ -29,8 +29,8 @@ from space_dist.curricula.interface import (
     Wants,
 )
 from space_dist.errors import ConfigError, SpaceDistError, nearest
-from space_dist.importing import load
 from space_dist.instances import ContextBounds, InstanceSet
+from space_dist.system.importing import load
 
 KEY: Final = "curriculum.import"
 _FROM_THE_RUN: Final = ("seed", "draws", "bounds")

@@ -17,15 +17,24 @@ from space_dist.envs.antgoal import BatchedAntGoal
 from space_dist.envs.ballcatching import BatchedBallCatching
 from space_dist.envs.carl import CarlEnv, is_carl
 from space_dist.envs.cartpole import BatchedCartPole
-from space_dist.envs.interface import BatchedEnv, ContextVisible, Drawable, DrawsContexts, KnowsOptimum, Step, close
+from space_dist.envs.interface import (
+    BatchedEnv,
+    ContextVisible,
+    Distribution,
+    Drawable,
+    DrawsContexts,
+    KnowsOptimum,
+    Step,
+    close,
+)
 from space_dist.envs.maze import BatchedMaze
 from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError, nearest
-from space_dist.importing import load
-from space_dist.instances import ContextBounds, Distribution
+from space_dist.instances import ContextBounds
+from space_dist.system.importing import load
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
@@ -222,6 +231,7 @@ __all__ = [
     "BatchedSingles",
     "ContextObservation",
     "ContextVisible",
+    "Distribution",
     "Drawable",
     "DrawsContexts",
     "KnowsOptimum",

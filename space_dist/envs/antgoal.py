@@ -17,8 +17,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.bullet import BatchedBullet, Camera, World
-from space_dist.envs.interface import FloatArray
-from space_dist.instances import ANTGOAL_BOUNDS, DISTRIBUTIONS
+from space_dist.envs.interface import Distribution, FloatArray
+from space_dist.instances import ContextBounds
 
 HORIZON: Final = 500
 """The paper's figure; the released code has 500 for SPaCE and round robin, and 150 elsewhere."""
@@ -43,6 +43,37 @@ AT_LIMIT_COST: Final = -0.1  # per joint
 LEGS: Final = 4
 ACTIONS_PER_LEG: Final = 2  # hip, ankle
 FEET: Final = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
+
+BOUNDS: Final = ContextBounds(
+    names=("goal_x", "goal_y", "disabled_leg"),
+    low=np.array([-750.0, -750.0, -1.0]),
+    high=np.array([750.0, 750.0, 3.0]),
+)
+"""AntGoal (Eimer et al. 2021): the goal in metres from the start, and the disabled leg, a whole number: -1 for none."""
+
+
+def _draw(rng: np.random.Generator, n: int, nearest_goal: float) -> NDArray[np.float64]:
+    """Goals uniform between `nearest_goal` and 750 on each axis; none or one of four legs, each as likely."""
+    goals = rng.uniform(nearest_goal, BOUNDS.high[:2], size=(n, 2))
+    return np.column_stack((goals, rng.integers(-1, 4, size=n)))
+
+
+DISTRIBUTIONS: Final = {
+    "antgoal_positive": Distribution(
+        description="AntGoal, goals uniform in the positive quadrant up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021; the quadrant is the released code's",
+        bounds=BOUNDS,
+        draw=lambda rng, n: _draw(rng, n, 0.0),
+    ),
+    "antgoal_all": Distribution(
+        description="AntGoal, goals uniform in all four quadrants up to 750 on each axis; no leg or one of four "
+        "disabled, each with probability 1/5",
+        source="Eimer et al. 2021 (goals at most 750 away)",
+        bounds=BOUNDS,
+        draw=lambda rng, n: _draw(rng, n, -750.0),
+    ),
+}
 
 
 @dataclass
@@ -172,7 +203,7 @@ class BatchedAntGoal(BatchedBullet[AntEpisode]):
         limit = np.full(16 + 8 + LEGS, OBSERVATION_LIMIT, dtype=np.float32)
         self.observation_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, shape=(LEGS * ACTIONS_PER_LEG,), dtype=np.float32)
-        self.context_bounds = ANTGOAL_BOUNDS
+        self.context_bounds = BOUNDS
         self.knows_success = False
         super().__init__(n_slots, horizon, AntWorld)
 

@@ -19,8 +19,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.bullet import BatchedBullet, Camera, World
-from space_dist.envs.interface import FloatArray
-from space_dist.instances import BALLCATCHING_BOUNDS
+from space_dist.envs.interface import Distribution, FloatArray
+from space_dist.instances import ContextBounds
 
 HORIZON: Final = 200  # Klink
 DT: Final = 0.002  # seconds per physics step; Klink
@@ -51,6 +51,28 @@ NET_CENTRE: Final = 0.17  # metres along the flange's axis; ours
 NET_MASS: Final = 0.2  # kg; ours
 BALL_RADIUS: Final = 0.033  # metres; a tennis ball's
 BALL_MASS: Final = 0.058  # kg; a tennis ball's
+
+BOUNDS: Final = ContextBounds(
+    names=("angle", "radius", "distance"),
+    low=np.array([0.125 * np.pi, 0.52, 0.75]),
+    high=np.array([0.5 * np.pi, 0.95, 4.0]),
+)
+"""BallCatching (Klink et al. 2020): angle in radians and radius in metres of the point that the ball flies to, seen
+from the arm's shoulder, and the distance in metres from which it comes.
+
+Klink et al. have radii from 0.6 to 1.1 for their longer arm: ours are these times 0.95 / 1.1, because the net's centre
+reaches 1.07 m.
+"""
+
+
+DISTRIBUTIONS: Final = {
+    "ballcatching_uniform": Distribution(
+        description="BallCatching, each feature uniform within its bounds",
+        source="Klink et al. 2020 (the bounds); the radius is scaled to our arm",
+        bounds=BOUNDS,
+        draw=lambda rng, n: rng.uniform(BOUNDS.low, BOUNDS.high, size=(n, 3)),
+    ),
+}
 
 
 @dataclass
@@ -171,7 +193,7 @@ class BatchedBallCatching(BatchedBullet[BallEpisode]):
         limit = np.full(3 * N_JOINTS, OBSERVATION_LIMIT, dtype=np.float32)
         self.observation_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, shape=(N_JOINTS,), dtype=np.float32)
-        self.context_bounds = BALLCATCHING_BOUNDS
+        self.context_bounds = BOUNDS
         self.knows_success = True
         super().__init__(n_slots, horizon, BallWorld)
 

@@ -22,6 +22,20 @@ IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
+class Distribution:
+    """What instances are drawn from. `draw(rng, n)` gives `(n, d)` contexts within `bounds`, independent rows.
+
+    `content` turns `(n, d)` contexts into rows that are equal where two contexts mean the same.
+    """
+
+    description: str
+    source: str
+    bounds: ContextBounds
+    draw: Callable[[np.random.Generator, int], NDArray[np.float64]]
+    content: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda contexts: contexts
+
+
+@dataclass(frozen=True)
 class Step:
     """What one step of all slots gave.
 

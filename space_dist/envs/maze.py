@@ -5,21 +5,48 @@ Facts: docs/environments.md ("Maze").
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.interface import FloatArray, IntArray, Step
-from space_dist.instances import MAZE_BOUNDS
-from space_dist.mazes import CELLS, GOAL, SIDE, START, carve, shortest_ways, successors
+from space_dist.envs.interface import Distribution, FloatArray, IntArray, Step
+from space_dist.envs.layouts import CELLS, GOAL, SIDE, START, carve, shortest_ways, successors, symmetrised
+from space_dist.instances import ContextBounds
 
 GOAL_REWARD = 1.0
 STEP_REWARD = -0.1 / CELLS  # of every step but the one onto the goal
 HORIZON = 200  # gym-maze registers 2,000: ours is shorter
 
+BOUNDS: Final = ContextBounds(
+    names=tuple(f"cell_{x}_{y}" for y in range(SIDE) for x in range(SIDE)),
+    low=np.zeros(CELLS),
+    high=np.full(CELLS, 15.0),
+)
+"""Maze: the bits of each cell's open sides (north 1, east 2, south 4, west 8), in reading order; `cell_x_y`."""
+
+
+DISTRIBUTIONS: Final = {
+    "maze_dfs": Distribution(
+        description="Maze, perfect 5x5 mazes carved depth first from a random cell, symmetrised",
+        source="gym-maze's generator; the paper released no settings",
+        bounds=BOUNDS,
+        draw=carve,
+    ),
+    "maze_dfs_raw": Distribution(
+        description="Maze, the mazes of maze_dfs with the released code's numbers, which depend on where the carving "
+        "began",
+        source="gym-maze's generator",
+        bounds=BOUNDS,
+        draw=lambda rng, n: carve(rng, n, raw=True),
+        content=symmetrised,
+    ),
+}
+
 
 class BatchedMaze:
-    """`n_slots` mazes. Context: the 25 numbers of a layout (see `space_dist.mazes`); the whole maze, not a view.
+    """`n_slots` mazes. Context: the 25 numbers of a layout (see `space_dist.envs.layouts`); the whole maze, not a view.
 
     Observed are the integers (x, y); (0, 0) is the start. Actions: 0 north (y - 1), 1 south, 2 east, 3 west; a blocked
     move stays. The step onto the goal (4, 4) pays 1 and ends the episode, every other one costs 0.004. Nothing is
@@ -30,7 +57,7 @@ class BatchedMaze:
         self.n_slots, self.horizon = n_slots, horizon
         self.observation_space = spaces.Box(0, SIDE - 1, shape=(2,), dtype=np.int64)
         self.action_space = spaces.Discrete(4)
-        self.context_bounds = MAZE_BOUNDS
+        self.context_bounds = BOUNDS
         self._next = np.zeros((n_slots, CELLS, 4), dtype=np.int64)
         self._slots = np.arange(n_slots)
         self._cell = np.full(n_slots, START)

@@ -5,12 +5,14 @@ Facts: docs/environments.md ("PointMass"); Klink et al., "Self-Paced Deep Reinfo
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist.envs.interface import FloatArray, IntArray, Step
-from space_dist.instances import POINTMASS_BOUNDS
+from space_dist.envs.interface import Distribution, FloatArray, IntArray, Step
+from space_dist.instances import ContextBounds
 
 DT = 0.01  # seconds per inner step
 INNER_STEPS = 10  # physics steps per action
@@ -23,6 +25,44 @@ GOAL = np.array([0.0, -3.0])
 SUCCESS_DISTANCE = 0.25
 REWARD_DECAY = 0.6  # per unit of distance to the goal
 HORIZON = 100
+
+BOUNDS: Final = ContextBounds(
+    names=("gate_x", "gate_width", "friction"),
+    low=np.array([-4.0, 0.5, 0.0]),
+    high=np.array([4.0, 8.0, 4.0]),
+)
+"""PointMass (Klink et al. 2020): centre and width of the gate in the world's length units, friction in 1/s."""
+
+
+def _draw_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    return rng.uniform(BOUNDS.low, BOUNDS.high, size=(n, 3))
+
+
+def _draw_target(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """The target N((2.5, 0.5, 0), sigma (4e-3, 3.75e-3, 2e-3)), *clipped* to the bounds.
+
+    Two of its means lie on a lower bound, so about half of the gate widths are exactly 0.5 and half of the frictions
+    exactly 0.
+    """
+    drawn = rng.normal((2.5, 0.5, 0.0), (4e-3, 3.75e-3, 2e-3), size=(n, 3))
+    return np.clip(drawn, BOUNDS.low, BOUNDS.high)
+
+
+DISTRIBUTIONS: Final = {
+    "pointmass_uniform": Distribution(
+        description="PointMass, each feature uniform within its bounds",
+        source="Klink et al. 2020 (the bounds)",
+        bounds=BOUNDS,
+        draw=_draw_uniform,
+    ),
+    "pointmass_target": Distribution(
+        description="PointMass, N((2.5, 0.5, 0), sigma (4e-3, 3.75e-3, 2e-3)) clipped to the bounds, which puts "
+        "about half of the gate widths at 0.5 and half of the frictions at 0",
+        source="Klink et al. 2020 (the target distribution); the clipping is ours",
+        bounds=BOUNDS,
+        draw=_draw_target,
+    ),
+}
 
 
 class BatchedPointMass:
@@ -37,7 +77,7 @@ class BatchedPointMass:
         limit = np.array([POSITION_LIMIT, np.inf, POSITION_LIMIT, np.inf], dtype=np.float32)
         self.observation_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, shape=(2,), dtype=np.float32)
-        self.context_bounds = POINTMASS_BOUNDS
+        self.context_bounds = BOUNDS
         self._position = np.zeros((2, n_slots))  # x and y
         self._velocity = np.zeros((2, n_slots))
         self._context = np.zeros((3, n_slots))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from space_dist.errors import SpaceDistError
 from space_dist.learner.interface import Arrays, Update
 from space_dist.learner.population import PopulationLearner, learn_together
-from space_dist.policy import Several, Statistics
 from space_dist.rollout import Shard
+from space_dist.rollout.policy import Several, Statistics
 
 
 class CoupledLearner:

@@ -16,8 +16,8 @@ from space_dist.config import LearnerConfig, ValueDisagreementConfig
 from space_dist.envs import Observations
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.interface import Arrays
-from space_dist.policy import EnsemblePolicy, Layers, Statistics, seen_by_members
 from space_dist.rollout import Shard
+from space_dist.rollout.policy import EnsemblePolicy, Layers, Statistics, seen_by_members
 from space_dist.seeding import Purpose, generator
 
 Array = NDArray[np.float32]

@@ -19,8 +19,8 @@ from space_dist.config import LearnerConfig
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
 from space_dist.learner.normaliser import Normaliser
-from space_dist.policy import Policy, Several, Statistics
 from space_dist.rollout import Shard
+from space_dist.rollout.policy import Policy, Several, Statistics
 from space_dist.seeding import Purpose, global_generators, global_seeds
 
 if TYPE_CHECKING:  # it derives from what is here

@@ -19,8 +19,8 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from space_dist.config import A2CConfig, DQNConfig, LearnerConfig
 from space_dist.envs import Observations
 from space_dist.errors import ConfigError
-from space_dist.importing import load
-from space_dist.policy import Array, Head, Layers, Statistics
+from space_dist.rollout.policy import Array, Head, Layers, Statistics
+from space_dist.system.importing import load
 
 ALGORITHMS: dict[str, Any] = {
     "ppo": PPO, "trpo": TRPO, "a2c": A2C, "dqn": DQN, "sac": SAC, "td3": TD3,

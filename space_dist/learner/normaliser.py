@@ -11,8 +11,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs import Observations
-from space_dist.policy import Statistics
 from space_dist.rollout import Shard
+from space_dist.rollout.policy import Statistics
 
 REWARD_CLIP = 10.0  # of normalised rewards; SB3's VecNormalize
 FloatArray = NDArray[np.float64]

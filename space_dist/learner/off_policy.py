@@ -19,8 +19,8 @@ from space_dist.envs.observations import each, put, take
 from space_dist.learner.interface import Arrays, SB3Learner, schedule
 from space_dist.learner.lean_replay import LEAN
 from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs
-from space_dist.policy import Exploration, Head, MlpPolicy, Statistics
 from space_dist.rollout import Shard
+from space_dist.rollout.policy import Exploration, Head, MlpPolicy, Statistics
 
 _OURS = {
     "kind", "policy", "n_steps", "n_episodes", "learning_rate", "learning_rate_schedule", "net_arch", "activation",

@@ -19,8 +19,8 @@ from space_dist.envs.observations import concatenate, each, put, rows
 from space_dist.learner.interface import SB3Learner, schedule
 from space_dist.learner.lean import LeanPPO
 from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs, tensors
-from space_dist.policy import Head, MlpPolicy, Statistics
 from space_dist.rollout import Shard
+from space_dist.rollout.policy import Head, MlpPolicy, Statistics
 
 _OURS = {
     "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation", "log_std_init",

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from space_dist.errors import ConfigError
-from space_dist.files import atomic_write
 from space_dist.ledger import Ledger
 from space_dist.report.document import Document, Picture, Section, to_markdown
 from space_dist.report.figures import draw_comparison, draw_contexts, draw_curriculum, draw_learning_curve, png, save
@@ -15,6 +14,7 @@ from space_dist.report.grid_report import GridReport, build_grid_report
 from space_dist.report.load import Configuration, Run, group, load_run, read_config
 from space_dist.report.statistics import Estimate, Interval, confidence_interval, estimate, interquartile_mean
 from space_dist.report.tables import Summary, cells, few_seeds, numbers, remarks, summarise, to_csv
+from space_dist.system.files import atomic_write
 
 __all__ = [
     "Configuration",

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from space_dist.cluster import make_curriculum
 from space_dist.config import CustomConfig, FixedConfig, GrowingConfig, RoundRobinConfig, RunConfig
 from space_dist.curricula import Feedback, SetState
+from space_dist.curricula.making import make_curriculum
 from space_dist.curricula.variants import readings
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.instances import ContextBounds, InstanceSet

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from space_dist.errors import LedgerError
-from space_dist.files import atomic_write
 from space_dist.report.load import Configuration, FloatArray, IntArray, Run
 from space_dist.report.statistics import confidence_interval, interquartile_mean
+from space_dist.system.files import atomic_write
 
 # Okabe and Ito's palette: told apart with every common colour blindness; its yellow is left out, too pale for lines.
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")

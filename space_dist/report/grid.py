@@ -19,9 +19,10 @@ from typing import Any, Final
 import numpy as np
 
 from space_dist.config import clean, flattened
-from space_dist.endings import Evidence, why_ended
 from space_dist.errors import LedgerError
-from space_dist.manifest import Cell, Grid, Manifest
+from space_dist.experiment.endings import Evidence, why_ended
+from space_dist.experiment.manifest import Cell, Grid, Manifest
+from space_dist.experiment.status import Standing, standings
 from space_dist.report.figures import HeatMap
 from space_dist.report.load import Configuration, FloatArray, Run, load_run
 from space_dist.report.statistics import (
@@ -36,7 +37,6 @@ from space_dist.report.statistics import (
     stratified,
 )
 from space_dist.report.tables import Summary, finals, summarise
-from space_dist.standing import Standing, standings
 
 MAX_MAPS: Final = 24
 MAX_POOLED: Final = 200  # settings of which cells are pooled

@@ -11,8 +11,7 @@ from typing import Final
 
 from space_dist.config import clean
 from space_dist.errors import ConfigError
-from space_dist.files import atomic_write
-from space_dist.manifest import Grid, Manifest
+from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
 from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, draw_heat_map, draw_panels, png
 from space_dist.report.grid import (
@@ -46,6 +45,7 @@ from space_dist.report.tables import (
     steps_text,
     to_csv,
 )
+from space_dist.system.files import atomic_write
 
 MAX_DRAWN: Final = 48  # cells with a learning curve
 MAX_LISTED: Final = 100  # failures, remarks

@@ -29,7 +29,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
-from space_dist.cluster import Evidence, Seat
 from space_dist.config import (
     CurriculumConfig,
     GrowingConfig,
@@ -53,15 +52,16 @@ from space_dist.envs import BatchedEnv
 from space_dist.envs.interface import knows_success, starts_alike
 from space_dist.envs.observations import put, take
 from space_dist.envs.spec import EnvironmentSpec
-from space_dist.episodes import joined_episodes, mean_sizes, told
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
-from space_dist.policy import Valuing
 from space_dist.rollout import Outcomes, Setup, Worker, endless
+from space_dist.rollout.episodes import joined_episodes, mean_sizes, told
+from space_dist.rollout.policy import Valuing
+from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
+from space_dist.run.cluster import Evidence, Seat
 from space_dist.sb3.script import Scored, Wrapped, gradient_steps, network, refuse_model, weights, with_weights
 from space_dist.sb3.vec_env import ContextVecEnv, Course
 from space_dist.seeding import Purpose, episode_seeds, global_generators, global_seeds
-from space_dist.walk import Unfinished, Walk, stacked, unstacked
 
 if TYPE_CHECKING:
     from space_dist.learner import Ensemble

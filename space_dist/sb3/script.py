@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import (
 from space_dist.envs import Observations
 from space_dist.envs.observations import take
 from space_dist.errors import ConfigError
-from space_dist.policy import Statistics
+from space_dist.rollout.policy import Statistics
 from space_dist.sb3.vec_env import ContextVecEnv
 
 _WRAPPERS = (VecNormalize, VecMonitor, VecTransposeImage, VecCheckNan)

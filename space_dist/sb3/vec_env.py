@@ -29,7 +29,7 @@ from space_dist.envs.observations import Observations, allocate, concatenate, pu
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
 from space_dist.rollout import EpisodeTable, Shard, Stage, Walking, endless, replayed
-from space_dist.walk import Unfinished
+from space_dist.rollout.walk import Unfinished
 
 _FREE = 1 << 32  # the first round of an environment that nobody drives; no run has so many
 _FREE_STEPS = 1024  # of such a round

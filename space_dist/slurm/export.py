@@ -20,9 +20,9 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from space_dist.config import clean
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.files import atomic_write
-from space_dist.manifest import Grid, Manifest
+from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.slurm.profile import Profile, variables_in
+from space_dist.system.files import atomic_write
 
 Mode = Literal["array", "cluster"]
 TRAIN, AGGREGATE, SUBMIT, README = "train.sbatch", "aggregate.sbatch", "submit.sh", "README.md"

@@ -22,7 +22,7 @@ from types import FrameType
 import psutil
 
 from space_dist.errors import SpaceDistError, nearest
-from space_dist.importing import PYTHON
+from space_dist.system.importing import PYTHON
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _OBJECT_STORE_BYTES = 256 << 20
@@ -163,7 +163,7 @@ def _alive(process: psutil.Process) -> bool:
 def _is_supervisor(process: psutil.Process) -> bool:
     """Whether it supervises a run, or is one: those are forks, with the same command line."""
     with contextlib.suppress(psutil.Error):
-        return "space_dist.supervisor" in process.cmdline()
+        return "space_dist.grid.supervisor" in process.cmdline()
     return False
 
 

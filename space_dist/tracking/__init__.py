@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from space_dist.errors import LedgerError
+from space_dist.experiment.manifest import CELL_ID_DIGITS, MANIFEST, Grid
 from space_dist.ledger import Ledger, Status
-from space_dist.manifest import CELL_ID_DIGITS, MANIFEST, Grid
 from space_dist.tracking.grids import GridMirror
 from space_dist.tracking.runs import (
     GRID_TAG,

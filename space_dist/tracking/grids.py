@@ -18,12 +18,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from space_dist.endings import Cause, Evidence, why_ended
 from space_dist.errors import LedgerError
+from space_dist.experiment.endings import Cause, Evidence, why_ended
+from space_dist.experiment.manifest import Cell, Grid, Manifest, Run
+from space_dist.experiment.status import Attempts, History, Standing, standing_of
 from space_dist.ledger import METRICS, Ledger, Row, Status, decode_row
-from space_dist.manifest import Cell, Grid, Manifest, Run
-from space_dist.provenance import code_digest
-from space_dist.standing import Attempts, History, Standing, standing_of
+from space_dist.system.provenance import code_digest
 from space_dist.tracking.runs import (
     GRID_TAG,
     MAX_TAG,

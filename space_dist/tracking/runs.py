@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from space_dist.config.tracking_uri import UriError, checked_uri
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
-from space_dist.files import in_words, locked
-from space_dist.importing import PYTHON
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
-from space_dist.place import absolute_uri
-from space_dist.tracking_uri import UriError, checked_uri
+from space_dist.system.files import in_words, locked
+from space_dist.system.importing import PYTHON
+from space_dist.system.workplace import absolute_uri
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

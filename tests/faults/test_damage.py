@@ -13,14 +13,14 @@ import pytest
 
 from space_dist import config as configs
 from space_dist import ledger as ledgers
-from space_dist.building import spec_of
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import LedgerError, SpaceDistError
-from space_dist.files import read_file
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch, policy_of, stored_config
 from space_dist.ledger import METRICS, ROW_FILES, Checkpoint, Ledger, RunWriter, decode_checkpoint
 from space_dist.report import load_run
+from space_dist.run.building import spec_of
+from space_dist.run.launch import launch, policy_of, stored_config
+from space_dist.system.files import read_file
+from space_dist.system.interrupts import StopRequests
 from tests.faults.test_every_write import short
 from tests.test_learners import results
 

@@ -12,11 +12,11 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import Ledger
 from space_dist.report import load_run
 from space_dist.report.load import standing
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.patience import PATIENCE
 from tests.test_learners import config_for, learner_section, results

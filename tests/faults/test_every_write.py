@@ -12,9 +12,9 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.errors import LedgerError, SpaceDistError
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.faults.injection import Disk, Kills, bury_owner
 from tests.patience import PATIENCE

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
-from space_dist.place import private_ray
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.workplace import private_ray
 from tests.faults.test_every_write import short
 from tests.test_learners import results
 
@@ -31,7 +31,7 @@ def with_resources(config: configs.RunConfig, **resources: Any) -> configs.RunCo
 @pytest.fixture(scope="module")
 def cluster_class() -> Any:
     private_ray()
-    from space_dist.distributed import RayCluster
+    from space_dist.run.ray_cluster import RayCluster
 
     return RayCluster
 

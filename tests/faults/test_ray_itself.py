@@ -15,11 +15,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from space_dist import ray_watch
 from space_dist.config import to_yaml
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import Ledger
-from space_dist.ray_watch import Started, asked, parts, reach
+from space_dist.run import ray_watch
+from space_dist.run.ray_watch import Started, asked, parts, reach
 from tests import prepared
 from tests.patience import PATIENCE
 
@@ -164,7 +164,7 @@ ENDS = """
 import os, subprocess, sys
 from pathlib import Path
 import psutil
-from space_dist import ray_watch
+from space_dist.run import ray_watch
 
 started, folder, found = ray_watch.Started(), Path(sys.argv[1]), {}
 for name in ("raylet", "gcs_server"):

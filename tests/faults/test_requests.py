@@ -14,9 +14,9 @@ import psutil
 import pytest
 
 from space_dist import config as configs
-from space_dist.interrupts import STOP_SIGNALS, StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import Ledger
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import STOP_SIGNALS, StopRequests
 from tests import prepared
 from tests.faults.slow_env import PAUSE
 from tests.faults.test_every_write import short
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 
 WHAT_IS_IMPORTED = """
 import sys
-from space_dist.interrupts import StopRequests
+from space_dist.system.interrupts import StopRequests
 def install(self):
     print(*sorted({name.partition(".")[0] for name in sys.modules}))
     raise SystemExit(0)

@@ -14,8 +14,8 @@ import tempfile
 from pathlib import Path
 
 from space_dist import config as configs
-from space_dist.interrupts import StopRequests
-from space_dist.launch import arithmetic_digest, launch
+from space_dist.run.launch import arithmetic_digest, launch
+from space_dist.system.interrupts import StopRequests
 from tests.golden.cases import CASES, DIGESTS, run
 
 

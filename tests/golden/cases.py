@@ -8,9 +8,9 @@ import hashlib
 from pathlib import Path
 
 from space_dist import config as configs
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import CURRICULUM, METRICS, VALUES
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DIGESTS = Path(__file__).with_name("digests.json")

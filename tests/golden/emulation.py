@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from space_dist.errors import Interrupted
-from space_dist.interrupts import StopRequests
-from space_dist.launch import launch
 from space_dist.ledger import Ledger, Status
+from space_dist.run.launch import launch
+from space_dist.system.interrupts import StopRequests
 from tests.golden.cases import DIGESTS, ROOT, config_of, digests_of
 
 GOLDEN = json.loads(DIGESTS.read_text())

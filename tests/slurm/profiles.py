@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 from typing import Any
 
-from space_dist.manifest import Manifest
+from space_dist.experiment.manifest import Manifest
 from space_dist.slurm import Export, Mode, Profile
 
 RESERVATION = "course"  # which the test makes

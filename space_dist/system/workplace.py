@@ -7,7 +7,6 @@ import secrets
 import sys
 from pathlib import Path
 
-from space_dist.config import RunConfig
 from space_dist.errors import ConfigError
 
 RAY_DEFAULTS = {
@@ -20,9 +19,9 @@ RAY_DEFAULTS = {
 """What the environment says of Ray, unless the user has decided it, before Ray is imported."""
 
 
-def default_folder(config: RunConfig) -> Path:
+def default_folder(name: str, seed: int) -> Path:
     """`runs/<name>/s<seed>`, here."""
-    return workplace() / "runs" / config.name / f"s{config.seed}"
+    return workplace() / "runs" / name / f"s{seed}"
 
 
 def absolute_uri(uri: str | None) -> str | None:

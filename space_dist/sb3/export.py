@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
-from space_dist.building import learner_of, spec_of
 from space_dist.config import GrowingConfig, RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.instances import read_csv
-from space_dist.launch import stored_config
 from space_dist.learner import SB3Learner
 from space_dist.ledger import Checkpoint, Ledger
-from space_dist.policy import OBSERVATION_CLIP
+from space_dist.rollout.policy import OBSERVATION_CLIP
+from space_dist.run.building import learner_of, spec_of
+from space_dist.run.launch import stored_config
 from space_dist.sb3 import ContextVecEnv
 
 _ALGORITHMS = {

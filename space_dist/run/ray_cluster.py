@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from space_dist.place import RAY_DEFAULTS
+from space_dist.system.workplace import RAY_DEFAULTS
 
 os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
@@ -39,12 +39,13 @@ from threadpoolctl import threadpool_limits
 
 from space_dist.arithmetic import digest, numpy_digest, scipy_probes
 from space_dist.arithmetic import settings as arithmetic_settings
-from space_dist.cluster import Central, Decision, Evidence, Handle
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
-from space_dist.importing import folders_of_user, look_in
-from space_dist.ray_watch import (
+from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
+from space_dist.rollout.walk import Walk
+from space_dist.run.cluster import Central, Decision, Evidence, Handle
+from space_dist.run.ray_watch import (
     JOIN_SECONDS,
     SILENT_SECONDS,
     START_SECONDS,
@@ -56,8 +57,7 @@ from space_dist.ray_watch import (
     reach,
     watched,
 )
-from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
-from space_dist.walk import Walk
+from space_dist.system.importing import folders_of_user, look_in
 
 _OBJECT_STORE_BYTES = 256 << 20
 _STARTS = 5  # of a Ray of our own

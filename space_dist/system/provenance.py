@@ -44,7 +44,7 @@ def _version(distribution: str) -> str:
 @functools.cache
 def code_digest() -> str:
     """`(16 hex digits)` a hash of this package's own source files, by their paths and content."""
-    return _digest(Path(__file__).resolve().parent)
+    return _digest(Path(__file__).resolve().parents[1])
 
 
 def source_digest(import_path: str) -> str:
@@ -84,7 +84,7 @@ def _digest(folder: Path) -> str:
 
 def git_state() -> dict[str, str]:
     """The commit this package was checked out at, and whether it was edited since; empty outside a repository."""
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve().parents[1]
 
     def git(*arguments: str) -> str | None:
         try:

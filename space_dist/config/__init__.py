@@ -20,9 +20,9 @@ from ruamel.yaml.constructor import DuplicateKeyError, SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent
 
+from space_dist.config.tracking_uri import UriError, checked_uri
 from space_dist.errors import ConfigError, nearest
-from space_dist.importing import why_refused
-from space_dist.tracking_uri import UriError, checked_uri
+from space_dist.system.importing import why_refused
 
 M = TypeVar("M", bound=BaseModel)
 

@@ -21,14 +21,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from space_dist.endings import Ended
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
-from space_dist.files import appending, in_words, locked
-from space_dist.importing import PYTHON
+from space_dist.experiment.endings import Ended
+from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.experiment.status import Attempts, Standing, concluded, may_retry, standing_of, standings, unheard
 from space_dist.ledger import Lock
-from space_dist.manifest import Grid, Manifest, Run
-from space_dist.provenance import code_digest
-from space_dist.standing import Attempts, Standing, concluded, may_retry, standing_of, standings, unheard
+from space_dist.system.files import appending, in_words, locked
+from space_dist.system.importing import PYTHON
+from space_dist.system.provenance import code_digest
 from space_dist.tracking.pusher import ended_within
 
 log = logging.getLogger("space_dist")

@@ -13,11 +13,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from space_dist.config import CurriculumConfig, RunConfig
-from space_dist.curricula import Curriculum, Draws, Episodes, Feedback, Probes, Selection, State
+from space_dist.curricula import Curriculum, Episodes, Feedback, Probes, Selection, State
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Worker, joined
-from space_dist.walk import Walk
+from space_dist.rollout.walk import Walk
 
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
@@ -156,6 +156,8 @@ class Central(Seat):
     """The seat of a run's curriculum."""
 
     def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
+        from space_dist.curricula.making import make_curriculum
+
         super().__init__(make_curriculum(config, train, bounds), config.curriculum)
 
 
@@ -212,20 +214,6 @@ class InProcess:
     def close(self) -> None:
         """Close the environments."""
         self._worker.close()
-
-
-def make_curriculum(config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> Curriculum:
-    """The curriculum a config asks for. Raises ConfigError if it asks for instances or features that are not there.
-
-    bounds: of the contexts of the config's environment.
-    """
-    from space_dist.curricula.configured import Makers  # SciPy's optimisers, which rollout actors never need
-
-    rollout = config.rollout
-    return Makers(
-        train, source=str(config.instances.train), seed=config.seed, bounds=bounds,
-        draws=Draws(config.n_episodes or config.learner.n_steps * config.members, rollout.shards * config.members),
-    ).make(config.curriculum)  # fmt: skip
 
 
 def checked(values: FloatArray, what: str) -> FloatArray:

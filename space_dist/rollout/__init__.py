@@ -26,9 +26,9 @@ from space_dist.envs.observations import allocate, concatenate, distinct, put, r
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.policy import Noise, Policy, Several, Valuing, can_act_side_by_side, members_of, side_by_side
+from space_dist.rollout.policy import Noise, Policy, Several, Valuing, can_act_side_by_side, members_of, side_by_side
+from space_dist.rollout.walk import Unfinished, Walk
 from space_dist.seeding import Purpose, episode_seeds, generator
-from space_dist.walk import Unfinished, Walk
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -32,11 +32,9 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from space_dist.building import ensemble_of, learner_of, load_learner, model_of, total_steps
-from space_dist.cluster import Cluster, Decision, Evidence, Handle, checked, make_curriculum
 from space_dist.config import RunConfig
 from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
-from space_dist.episodes import joined_episodes, mean_sizes, summed, told
+from space_dist.curricula.making import make_curriculum
 from space_dist.errors import Interrupted
 from space_dist.learner import Arrays, Learner, Update
 from space_dist.ledger import (
@@ -52,10 +50,13 @@ from space_dist.ledger import (
     Status,
     encode_values,
 )
-from space_dist.policy import Statistics, blind, members_of
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
-from space_dist.run_state import RunState
-from space_dist.walk import Walk
+from space_dist.rollout.episodes import joined_episodes, mean_sizes, summed, told
+from space_dist.rollout.policy import Statistics, blind, members_of
+from space_dist.rollout.walk import Walk
+from space_dist.run.building import ensemble_of, learner_of, load_learner, model_of, total_steps
+from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
+from space_dist.run.state import RunState
 
 log = logging.getLogger("space_dist")
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import psutil
 
-from space_dist.endings import Cause, Ended, Evidence
 from space_dist.errors import SpaceDistError
-from space_dist.files import in_words
-from space_dist.importing import PYTHON
-from space_dist.manifest import Grid, Manifest, Run
-from space_dist.standing import settled
-from space_dist.supervisor import KILL_SECONDS, STOPPED_SECONDS, Task, Turn
+from space_dist.experiment.endings import Cause, Ended, Evidence
+from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.experiment.status import settled
+from space_dist.grid.supervisor import KILL_SECONDS, STOPPED_SECONDS, Task, Turn
+from space_dist.system.files import in_words
+from space_dist.system.importing import PYTHON
 
 log = logging.getLogger("space_dist")
 
@@ -39,7 +39,7 @@ class SupervisorLostError(Exception):
 
 
 class WarmSupervisor:
-    """`python -m space_dist.supervisor` behind two pipes: started with its first task, and anew when it is lost.
+    """`python -m space_dist.grid.supervisor` behind two pipes: started with its first task, and anew when it is lost.
 
     folder: of the grid, where what it says besides goes.
     """
@@ -107,7 +107,7 @@ class WarmSupervisor:
             self._process.wait()
 
     def _started(self) -> subprocess.Popen[bytes]:
-        command = [*PYTHON, "-m", "space_dist.supervisor"]
+        command = [*PYTHON, "-m", "space_dist.grid.supervisor"]
         # Nothing of a Ray actor's own identity: runs that join Ray join it as drivers.
         environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
         with (self._folder / "pool.log").open("ab") as errors:

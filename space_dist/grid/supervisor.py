@@ -5,8 +5,8 @@ with `engine: population` may share a process; each still has an attempt, and an
 of the supervisor, which has imported everything already: it starts in milliseconds, and whatever it does to itself
 (leaks, crashes, global state) ends with it.
 
-`python -m space_dist.supervisor` is a warm supervisor for many runs: a task a line on standard input, the end of each
-a line on standard output. When its input ends, so does it, after its run has made a checkpoint.
+`python -m space_dist.grid.supervisor` is a warm supervisor for many runs: a task a line on standard input, the end of
+each a line on standard output. When its input ends, so does it, after its run has made a checkpoint.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from typing import Any
 import psutil
 
 from space_dist.config import RunConfig
-from space_dist.endings import AskedBy, Busy, Ended, Evidence, Said, why_ended
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
-from space_dist.files import open_own
-from space_dist.importing import look_here_too
-from space_dist.interrupts import StopRequests
-from space_dist.manifest import Grid, Manifest, Run, RunResources
-from space_dist.standing import Attempts, is_done, last_lines, slurm_job
+from space_dist.experiment.endings import AskedBy, Busy, Ended, Evidence, Said, why_ended
+from space_dist.experiment.manifest import Grid, Manifest, Run, RunResources
+from space_dist.experiment.status import Attempts, is_done, last_lines, slurm_job
+from space_dist.system.files import open_own
+from space_dist.system.importing import look_here_too
+from space_dist.system.interrupts import StopRequests
 
 OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
@@ -347,11 +347,11 @@ def _child_main(work: Callable[[Tell], None], output: Path, pipe: int) -> int:
 
 
 def _work(grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str, tell: Tell) -> None:
-    from space_dist.launch import Outcome, launch
+    from space_dist.run.launch import Outcome, launch
 
     stop = StopRequests()
     stop.install()
-    from space_dist.population import advance, member
+    from space_dist.run.population import advance, member
 
     by_folder = {grid.ledger(run).folder: run for run in runs}
 
@@ -435,7 +435,7 @@ def main() -> None:
 def preload() -> None:
     """Import what every run needs, so that forks need not. Starts no thread."""
     import space_dist.learner
-    import space_dist.population  # noqa: F401
+    import space_dist.run.population  # noqa: F401
 
 
 if __name__ == "__main__":

@@ -28,18 +28,18 @@ from space_dist import config as configs
 from space_dist.config import RunConfig
 from space_dist.envs import Drawable, KnowsOptimum, close, takes_argument, unwrapped
 from space_dist.envs.cartpole import ANGLE_LIMIT, X_LIMIT
+from space_dist.envs.layouts import CELLS, SIDE, shortest_ways, successors
 from space_dist.envs.observations import take
 from space_dist.envs.pointmass import GOAL, POSITION_LIMIT, SUCCESS_DISTANCE
 from space_dist.envs.spec import read_spec
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.files import atomic_write
 from space_dist.instances import InstanceSet, read_csv
-from space_dist.launch import policy_of
 from space_dist.ledger import Ledger
-from space_dist.mazes import CELLS, SIDE, shortest_ways, successors
-from space_dist.policy import Policy, members_of
 from space_dist.rollout import Split
+from space_dist.rollout.policy import Policy, members_of
+from space_dist.run.launch import policy_of
 from space_dist.seeding import Purpose, episode_seeds
+from space_dist.system.files import atomic_write
 
 MAX_FRAMES: Final = 120  # of a GIF; of longer episodes only every second, third, ... step is shown
 PANELS: Final = 5  # a side of the square of trajectories

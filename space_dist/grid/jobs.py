@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from space_dist.place import RAY_DEFAULTS
+from space_dist.system.workplace import RAY_DEFAULTS
 
 os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
@@ -28,16 +28,16 @@ import ray
 import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
-from space_dist.distributed import attended, join_ray, remove_session
-from space_dist.endings import Busy, Ended, Evidence
 from space_dist.errors import Interrupted, SpaceDistError
-from space_dist.grid import Conductor, Overview
-from space_dist.importing import PYTHON
-from space_dist.manifest import Grid, Manifest, Run
-from space_dist.ray_pool import Nonce, Pool
-from space_dist.standing import Attempts, Standing, settled
-from space_dist.supervisor import Turn, ray_answers
-from space_dist.warm import cores, slurms_memory_of_a_core
+from space_dist.experiment.endings import Busy, Ended, Evidence
+from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.experiment.status import Attempts, Standing, settled
+from space_dist.grid.conductor import Conductor, Overview
+from space_dist.grid.pool import Nonce, Pool
+from space_dist.grid.supervisor import Turn, ray_answers
+from space_dist.grid.warm import cores, slurms_memory_of_a_core
+from space_dist.run.ray_cluster import attended, join_ray, remove_session
+from space_dist.system.importing import PYTHON
 
 log = logging.getLogger("space_dist")
 

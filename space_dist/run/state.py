@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.curricula import Episodes
-from space_dist.episodes import joined_episodes
 from space_dist.ledger import Checkpoint
 from space_dist.rollout import Setup
-from space_dist.walk import Walk, stacked, unstacked
+from space_dist.rollout.episodes import joined_episodes
+from space_dist.rollout.walk import Walk, stacked, unstacked
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -25,8 +25,6 @@ from threadpoolctl import threadpool_limits
 
 from space_dist import arithmetic
 from space_dist import config as configs
-from space_dist.building import make_setup, policy_in, resolved, spec_of
-from space_dist.cluster import Cluster, InProcess
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.envs.spec import EnvironmentSpec
@@ -40,18 +38,20 @@ from space_dist.errors import (
     exits_refused,
     nearest,
 )
-from space_dist.files import LogFile, appending, in_words
-from space_dist.importing import PYTHON
 from space_dist.instances import ContextBounds, InstanceSet, read_csv, refuse_overlap
-from space_dist.interrupts import StopRequests
 from space_dist.learner import refuse_machine, torch_probes
 from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
-from space_dist.place import absolute_uri, private_ray
-from space_dist.policy import Policy, Several, from_arrays
-from space_dist.provenance import fingerprint
 from space_dist.rollout import Setup
+from space_dist.rollout.policy import Policy, Several, from_arrays
+from space_dist.run.building import make_setup, policy_in, resolved, spec_of
+from space_dist.run.cluster import Cluster, InProcess
+from space_dist.run.training import Progress, Training
+from space_dist.system.files import LogFile, appending, in_words
+from space_dist.system.importing import PYTHON
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.provenance import fingerprint
+from space_dist.system.workplace import absolute_uri, private_ray
 from space_dist.tracking.pusher import ended_within
-from space_dist.training import Progress, Training
 
 log = logging.getLogger("space_dist")
 
@@ -361,7 +361,7 @@ def _cluster(course: Course) -> Iterator[Cluster]:
         return
     if course.config.resources.address == "local":
         private_ray()
-    from space_dist.distributed import RayCluster  # Ray takes a second to import and is not needed without workers
+    from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
         with course.stop.standing():  # ray.init would replace SIGTERM's handler

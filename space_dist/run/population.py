@@ -18,16 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from space_dist.cluster import Handle, InProcess
 from space_dist.config import RunConfig
 from space_dist.envs import BatchedEnv, close
 from space_dist.errors import SpaceDistError, exits_refused
-from space_dist.interrupts import StopRequests
-from space_dist.launch import Outcome, begun, speaking
 from space_dist.learner import PopulationLearner, learn_together
 from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Stage, Trial, collect, evaluate
-from space_dist.training import Learn, Wait, Work
-from space_dist.walk import Walk
+from space_dist.rollout.walk import Walk
+from space_dist.run.cluster import Handle, InProcess
+from space_dist.run.launch import Outcome, begun, speaking
+from space_dist.run.training import Learn, Wait, Work
+from space_dist.system.interrupts import StopRequests
 
 _SLOTS = 1024  # environments stepped together, at most: what the cache holds of them. Decides no result
 _KEPT = 4  # batches of environments that are kept, beside those in which episodes go on

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from space_dist.endings import Busy, Cause, Ended, Evidence, why_ended
 from space_dist.errors import LedgerError
-from space_dist.files import in_words, open_own
+from space_dist.experiment.endings import Busy, Cause, Ended, Evidence, why_ended
+from space_dist.experiment.manifest import Grid, Manifest, Retry, Run
 from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, process_of, this_process
-from space_dist.manifest import Grid, Manifest, Retry, Run
+from space_dist.system.files import in_words, open_own
 
 ATTEMPTS = "attempts.jsonl"
 MAX_DETAIL = 4000  # characters

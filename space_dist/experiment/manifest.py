@@ -24,10 +24,10 @@ from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
 from space_dist.config import NAME, Patience, ResourcesConfig, RunConfig, Section
+from space_dist.config.tracking_uri import checked_uri
 from space_dist.errors import ConfigError, LedgerError, nearest
-from space_dist.files import atomic_write
 from space_dist.ledger import Ledger, owner_alive
-from space_dist.tracking_uri import checked_uri
+from space_dist.system.files import atomic_write
 
 FORMAT = 1
 MANIFEST = "manifest.json"

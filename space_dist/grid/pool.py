@@ -18,19 +18,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from space_dist.place import RAY_DEFAULTS
+from space_dist.system.workplace import RAY_DEFAULTS
 
 os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
 import ray
 from ray.exceptions import RayActorError, RayError
 
-from space_dist.endings import Ended, Evidence
 from space_dist.errors import LedgerError, SpaceDistError
+from space_dist.experiment.endings import Ended, Evidence
+from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.grid.supervisor import Task, Turn, ray_answers
+from space_dist.grid.warm import SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
 from space_dist.ledger import believed_alive, this_process
-from space_dist.manifest import Grid, Manifest, Run
-from space_dist.supervisor import Task, Turn, ray_answers
-from space_dist.warm import SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
 
 log = logging.getLogger("space_dist")
 

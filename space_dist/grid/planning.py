@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from space_dist import config as configs
-from space_dist.building import make_setup, memory_of, resolved, spec_of, stack_of, total_steps
 from space_dist.config import RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, about
-from space_dist.grid import freeze
+from space_dist.experiment.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
+from space_dist.grid.conductor import freeze
 from space_dist.instances import ContextBounds, InstanceSet
-from space_dist.launch import read_instances
-from space_dist.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
-from space_dist.place import absolute_uri
-from space_dist.provenance import code_digest, git_state, source_digest
+from space_dist.run.building import make_setup, memory_of, resolved, spec_of, stack_of, total_steps
+from space_dist.run.launch import read_instances
+from space_dist.system.provenance import code_digest, git_state, source_digest
+from space_dist.system.workplace import absolute_uri
 
 
 @dataclass(frozen=True)

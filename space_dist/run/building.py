@@ -7,9 +7,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from space_dist.cluster import make_curriculum
 from space_dist.config import RunConfig, learners_that
 from space_dist.curricula import Curriculum
+from space_dist.curricula.making import make_curriculum
 from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
@@ -25,8 +25,8 @@ from space_dist.learner import (
     stack_key,
 )
 from space_dist.ledger import Checkpoint
-from space_dist.policy import MlpPolicy, Policy, Several, to_arrays
 from space_dist.rollout import Setup
+from space_dist.rollout.policy import MlpPolicy, Policy, Several, to_arrays
 from space_dist.seeding import member_seeds
 
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ

@@ -46,7 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.errors import LedgerError, RunLockedError
-from space_dist.files import TEMPORARIES, appending, atomic_write, locked, read_file, why_not_own
+from space_dist.system.files import TEMPORARIES, appending, atomic_write, locked, read_file, why_not_own
 
 log = logging.getLogger("space_dist")
 

@@ -1,0 +1,1 @@
+"""One run: `training` is its loop, `building` makes its parts, `cluster` does its work, `launch` starts it."""

@@ -1,0 +1,1 @@
+"""What is around us: `files`, signals (`interrupts`), modules (`importing`), `provenance`, the `workplace`."""
