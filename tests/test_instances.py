@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from space_dist.envs import distributions as module
+from space_dist import instances as module
 from space_dist.envs.distributions import DISTRIBUTIONS, sample
 from space_dist.envs.pointmass import BOUNDS as POINTMASS_BOUNDS
 from space_dist.errors import ConfigError
@@ -483,10 +483,10 @@ def test_samples(name: str) -> None:
         assert shared.sum() <= (5 if name.startswith("maze") else 0)  # there are only so many mazes
 
 
-def test_each_distribution_has_its_own_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_distribution_has_its_own_stream() -> None:
     one = DISTRIBUTIONS["pointmass_uniform"]
-    monkeypatch.setattr(module, "DISTRIBUTIONS", {"one": one, "other": one})
-    assert sample("one", 5, 5, seed=0) != sample("other", 5, 5, seed=0)
+    known = {"one": one, "other": one}
+    assert sample("one", 5, 5, seed=0, known=known) != sample("other", 5, 5, seed=0, known=known)
 
 
 def assert_moments(values: np.ndarray, mean: float, std: float, fourth: float) -> None:
@@ -514,17 +514,16 @@ def test_moments_of_the_target_distribution() -> None:
         assert abs((values == bound).mean() - 0.5) < 5 * 0.5 / math.sqrt(20_000)
 
 
-def test_repeated_draws_are_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_draws_are_drawn_again() -> None:
     dice = replace(
         DISTRIBUTIONS["pointmass_uniform"],
         bounds=ContextBounds(("side",), np.array([0.0]), np.array([5.0])),
         draw=lambda rng, n: rng.integers(0, 6, (n, 1)).astype(float),
     )
-    monkeypatch.setattr(module, "DISTRIBUTIONS", {"dice": dice})
-    train, test = sample("dice", 4, 2, seed=0)
+    train, test = sample("dice", 4, 2, seed=0, known={"dice": dice})
     assert sorted([*train.contexts[:, 0], *test.contexts[:, 0]]) == [0, 1, 2, 3, 4, 5]
     with pytest.raises(ConfigError, match="found only 6 distinct contexts of dice where 7 were asked for"):
-        sample("dice", 4, 3, seed=0)
+        sample("dice", 4, 3, seed=0, known={"dice": dice})
 
 
 @pytest.mark.parametrize(
