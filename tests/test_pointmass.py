@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 import subprocess
 import sys
@@ -10,7 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from space_dist.envs import BatchedPointMass, ContextObservation, ContextVisible
+from space_dist.envs import BatchedPointMass, ContextObservation, ContextVisible, unwrapped
+from space_dist.envs.spec import read_spec
 
 ENV_ID = "space_dist/PointMass-v0"
 LOW, HIGH = np.array([-4.0, 0.5, 0.0]), np.array([4.0, 8.0, 4.0])
@@ -387,3 +389,35 @@ def test_success_is_told_in_info() -> None:
         observation, _, _, _, info = env.step(toward(observation[None], (0.0, -3.0))[0])
         told.append(info["success"])
     assert (told[0], told[-1]) == (False, True)
+
+
+@pytest.mark.parametrize("n_slots", [1, 3, 16, 70])
+@pytest.mark.parametrize("size", [1.0, 6.0, 50.0])
+def test_compiled_physics_have_the_same_bits(n_slots: int, size: float) -> None:
+    """Over crashes, ends and new episodes; and for actions that are no numbers."""
+    plain, compiled = BatchedPointMass(n_slots), BatchedPointMass(n_slots)
+    compiled.compile()
+    rng = np.random.default_rng(n_slots)
+    contexts = rng.uniform(LOW, HIGH, (n_slots, 3))
+    beginning, seeds, crashes, ends = np.arange(n_slots), np.arange(n_slots, dtype=np.uint64), 0, 0
+    for _ in range(250):
+        starts = [env.reset(beginning, contexts[beginning], seeds[beginning]) for env in (plain, compiled)]
+        assert starts[0].tobytes() == starts[1].tobytes()
+        actions = rng.normal(0.0, size, (n_slots, 2)).astype(np.float32)
+        one, two = plain.step(actions), compiled.step(actions)
+        for name in ("observations", "rewards", "terminated", "truncated", "success"):
+            assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+        beginning = np.flatnonzero(one.terminated | one.truncated)
+        seeds[beginning] += np.uint64(n_slots)
+        crashes, ends = crashes + int(one.terminated.sum()), ends + int(one.truncated.sum())
+    assert n_slots < 16 or (ends if size == 1.0 else crashes)
+    for broken in (np.nan, np.inf, -np.inf):
+        actions[:, 0] = broken
+        one, two = plain.step(actions), compiled.step(actions)
+        assert one.observations.tobytes() == two.observations.tobytes()
+
+
+def test_whoever_wraps_it_reaches_the_compiled_physics() -> None:
+    spec = read_spec(ENV_ID, context_visible=True)
+    with dataclasses.replace(spec, compiled=True).opened(2) as compiled, spec.opened(2) as plain:
+        assert (unwrapped(compiled)._compiled is None, unwrapped(plain)._compiled is None) == (False, True)

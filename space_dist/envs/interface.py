@@ -108,6 +108,14 @@ MakeBatched = Callable[[int], BatchedEnv]
 
 
 @runtime_checkable
+class Compilable(Protocol):
+    """A batched environment that has a compiled twin of its physics. Asked for where learners are compiled as well."""
+
+    def compile(self) -> None:
+        """Compute steps by it from now on, with the same bits. May be called twice."""
+
+
+@runtime_checkable
 class DrawsContexts(Protocol):
     """A batched environment whose contexts are not just any numbers within their bounds."""
 

@@ -5,6 +5,8 @@ Facts: docs/environments.md ("PointMass"); Klink et al., "Self-Paced Deep Reinfo
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -86,6 +88,7 @@ class BatchedPointMass:
         self._noise = np.zeros((n_slots, horizon, INNER_STEPS, 2))
         self._drawn = np.zeros(n_slots, dtype=np.bool_)  # whether a slot's noise is that of the seed below
         self._drawn_for = np.zeros(n_slots, dtype=np.uint64)
+        self._compiled: Callable[..., None] | None = None
 
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> NDArray[np.float32]:
         """Start new episodes at (0, 3), at rest."""
@@ -102,8 +105,32 @@ class BatchedPointMass:
         for slot in np.flatnonzero((self._time == 0) & ~(self._drawn & (self._drawn_for == self._seeds))):
             np.random.default_rng(int(self._seeds[slot])).standard_normal(out=self._noise[slot])
             self._drawn[slot], self._drawn_for[slot] = True, self._seeds[slot]
+        crashed = self._advance(np.asarray(actions, dtype=np.float64))
+        self._time += 1
+        distance = np.hypot(self._position[0] - GOAL[0], self._position[1] - GOAL[1])
+        return Step(
+            observations=self._observe(),
+            rewards=np.exp(-REWARD_DECAY * distance),
+            terminated=crashed,
+            truncated=(self._time >= self.horizon) & ~crashed,
+            success=distance < SUCCESS_DISTANCE,
+        )
+
+    def compile(self) -> None:
+        """Have steps computed by a compiled twin from now on, with the same bits in a fraction of the time."""
+        from space_dist.kernels.pointmass import Physics, prepare
+
+        physics = Physics(DT, FORCE, NOISE_STD, ACTION_LIMIT, POSITION_LIMIT)
+        self._compiled = functools.partial(prepare(), physics)
+
+    def _advance(self, actions: FloatArray) -> NDArray[np.bool_]:
+        """Ten inner steps under (n_slots, 2) actions. Returns which slots hit the wall."""
+        if self._compiled is not None:
+            crashed = np.empty(self.n_slots, dtype=np.bool_)
+            self._compiled(self._position, self._velocity, self._context, actions, self._noise, self._time, crashed)
+            return crashed
         gate_x, gate_width, friction = self._context
-        force = FORCE * np.clip(actions.T.astype(np.float64), -ACTION_LIMIT, ACTION_LIMIT)
+        force = FORCE * np.clip(actions.T, -ACTION_LIMIT, ACTION_LIMIT)
         noise = self._noise[np.arange(self.n_slots), np.minimum(self._time, self.horizon - 1)]
         drive = np.ascontiguousarray(noise.transpose(1, 2, 0))  # (inner steps, 2, n_slots)
         drive *= NOISE_STD
@@ -121,16 +148,7 @@ class BatchedPointMass:
             velocity *= decay
             velocity += drive[inner]
         self._position = path[-1].copy()
-        crashed = self._hit_wall(path, gate_x, gate_width)
-        self._time += 1
-        distance = np.hypot(self._position[0] - GOAL[0], self._position[1] - GOAL[1])
-        return Step(
-            observations=self._observe(),
-            rewards=np.exp(-REWARD_DECAY * distance),
-            terminated=crashed,
-            truncated=(self._time >= self.horizon) & ~crashed,
-            success=distance < SUCCESS_DISTANCE,
-        )
+        return self._hit_wall(path, gate_x, gate_width)
 
     def _hit_wall(self, path: FloatArray, gate_x: FloatArray, gate_width: FloatArray) -> NDArray[np.bool_]:
         """Which slots crossed y = 0 outside their gate on `path` (inner + 1, 2, n_slots); they end at the wall."""

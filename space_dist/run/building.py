@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from typing import Any
 
@@ -40,7 +41,7 @@ def spec_of(config: RunConfig) -> EnvironmentSpec:
 def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, test: InstanceSet) -> Setup:
     """What workers must know. Raises ConfigError if the config cannot work with its environment or instances."""
     setup = Setup(
-        spec=spec,
+        spec=dataclasses.replace(spec, compiled=config.learner.is_compiled(config.engine)),
         seed=config.seed,
         gamma=config.learner.gamma,
         shards=config.rollout.shards * config.members,
