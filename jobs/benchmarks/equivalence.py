@@ -36,9 +36,7 @@ MARGIN = 0.05  # share of the pilot's mean return
 ALPHA = 0.05  # of each one-sided test
 POWER = 0.9  # where there is no difference
 PILOT = range(9000, 9024)
-BATCH_SIZE = (
-    512  # transitions; 40 gradient steps an update: with 320, SB3's arm takes 80 minutes of a core instead of 20
-)
+BATCH_SIZE = 512  # transitions: 40 gradient steps an update; with 320, SB3 takes hours of a core
 CONFIDENCE = 0.9  # in the limit of the pilot's standard deviation
 ARMS = {"sb3": 6000, "population": 7000, "control": 8000}  # their first seeds
 FEWEST, MOST = 10, 200  # seeds per arm
@@ -154,7 +152,8 @@ class _Arms:
         path = self.folder / f"{name}.yaml"
         path.write_text(configs.to_yaml({
             "name": name, "extends": str(self.config), "seeds": list(seeds), "tracking": {"uri": None},
-            "set": {"budget.steps": self.steps, "engine": engine, "learner.batch_size": BATCH_SIZE, "evaluation.every_steps": self.steps},
+            "set": {"budget.steps": self.steps, "engine": engine, "learner.batch_size": BATCH_SIZE,
+                    "evaluation.every_steps": self.steps},
         }))  # fmt: skip
         command = [sys.executable, "-m", "space_dist.cli", "grid", "run", str(path), "--root", str(self.folder),
                    "--max-parallel", str(self.max_parallel)]  # fmt: skip
