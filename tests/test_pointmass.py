@@ -396,7 +396,7 @@ def test_success_is_told_in_info() -> None:
 def test_compiled_physics_have_the_same_bits(n_slots: int, size: float) -> None:
     """Over crashes, ends and new episodes; and for actions that are no numbers."""
     plain, compiled = BatchedPointMass(n_slots), BatchedPointMass(n_slots)
-    compiled.compile()
+    compiled.compile_physics()
     rng = np.random.default_rng(n_slots)
     contexts = rng.uniform(LOW, HIGH, (n_slots, 3))
     beginning, seeds, crashes, ends = np.arange(n_slots), np.arange(n_slots, dtype=np.uint64), 0, 0

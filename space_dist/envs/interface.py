@@ -111,7 +111,7 @@ MakeBatched = Callable[[int], BatchedEnv]
 class Compilable(Protocol):
     """A batched environment that has a compiled twin of its physics. Asked for where learners are compiled as well."""
 
-    def compile(self) -> None:
+    def compile_physics(self) -> None:
         """Compute steps by it from now on, with the same bits. May be called twice."""
 
 

@@ -116,7 +116,7 @@ class BatchedPointMass:
             success=distance < SUCCESS_DISTANCE,
         )
 
-    def compile(self) -> None:
+    def compile_physics(self) -> None:
         """Have steps computed by a compiled twin from now on, with the same bits in a fraction of the time."""
         from space_dist.kernels.pointmass import Physics, prepare
 

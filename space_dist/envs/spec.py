@@ -43,7 +43,7 @@ class EnvironmentSpec:
         env = make_batched(self.env_id, n_slots, context_visible=self.context_visible, kwargs=self.kwargs)
         inner = unwrapped(env)
         if self.compiled and isinstance(inner, Compilable):
-            inner.compile()
+            inner.compile_physics()
         return env
 
     @contextlib.contextmanager
