@@ -1,6 +1,6 @@
 """SPaCE: Self-Paced Context Evaluation (Eimer et al., ICML 2021, Algorithm 1).
 
-`Space.step` is lines 6-13 of Algorithm 1, in order; line 5 (collect and update) is `training.py`. docs/algorithm.md
+`Space.step` is lines 6-13 of Algorithm 1, in order; line 5 (collect and update) is `run/training.py`. docs/algorithm.md
 maps the lines and names every place where the paper is silent or contradicts itself. The defaults are the paper's
 SPaCE; what the named variants do instead is in `variants.py`.
 """

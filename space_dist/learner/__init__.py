@@ -16,13 +16,9 @@ import torch
 from gymnasium import spaces
 
 from space_dist.config import (
-    A2CConfig,
-    DQNConfig,
     LearnerConfig,
     PPOConfig,
     RunConfig,
-    SACConfig,
-    TD3Config,
     TRPOConfig,
     ValueDisagreementConfig,
 )
@@ -33,7 +29,7 @@ from space_dist.learner.elementary import torch_probes  # and replaces kernels o
 from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, SB3Learner, Update, refuse_spaces
 from space_dist.learner.networks import is_mlp
-from space_dist.learner.off_policy import DQNLearner, OffPolicyLearner, SACLearner, TD3Learner
+from space_dist.learner.off_policy import OFF_POLICY, OffPolicyLearner
 from space_dist.learner.on_policy import OnPolicyLearner
 from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
 from space_dist.learner.population import refuse as refuse_population
@@ -66,13 +62,13 @@ def make_learner(
             config, observation_space, action_space,
             seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps, device=device,
         )  # fmt: skip
-    if isinstance(config, PPOConfig | TRPOConfig | A2CConfig):
-        return OnPolicyLearner(
-            config, observation_space, action_space,
-            seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
-        )  # fmt: skip
-    kinds: dict[type, type[OffPolicyLearner]] = {DQNConfig: DQNLearner, SACConfig: SACLearner, TD3Config: TD3Learner}
-    return kinds[type(config)](config, observation_space, action_space, seed=seed, total_steps=total_steps)
+    if config.keeps_next_observations:
+        learner = OFF_POLICY[type(config)]
+        return learner(config, observation_space, action_space, seed=seed, total_steps=total_steps)
+    return OnPolicyLearner(
+        config, observation_space, action_space,
+        seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
+    )  # fmt: skip
 
 
 def refuse_machine(config: RunConfig) -> None:

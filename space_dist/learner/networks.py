@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import sb3_contrib
+import stable_baselines3
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from sb3_contrib import TRPO
-from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
@@ -22,9 +22,12 @@ from space_dist.errors import ConfigError
 from space_dist.rollout.policy import Array, Head, Layers, Statistics
 from space_dist.system.importing import load
 
-ALGORITHMS: dict[str, Any] = {
-    "ppo": PPO, "trpo": TRPO, "a2c": A2C, "dqn": DQN, "sac": SAC, "td3": TD3,
-}  # fmt: skip
+ALGORITHMS: dict[str, Any] = {  # by kind: SB3's name in small letters
+    name.lower(): found
+    for library in (sb3_contrib, stable_baselines3)
+    for name in library.__all__
+    if isinstance(found := getattr(library, name), type) and issubclass(found, BaseAlgorithm)
+}
 
 _LEAST_IMAGE = 36  # pixels: what the convolutions of SB3's NatureCNN leave something of
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -240,6 +240,11 @@ class TD3Learner(_ContinuousLearner):
         return MlpPolicy(
             version, self._settings.activation, self._head(), actor, self._critics(), True, statistics
         )  # fmt: skip
+
+
+OFF_POLICY: dict[type, Callable[..., OffPolicyLearner]] = {  # by section of the config
+    DQNConfig: DQNLearner, SACConfig: SACLearner, TD3Config: TD3Learner,
+}  # fmt: skip
 
 
 def _transitions(shard: Shard) -> dict[str, NDArray[Any]]:

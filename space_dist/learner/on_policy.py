@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from space_dist.config import A2CConfig, PPOConfig, TRPOConfig
+from space_dist.config import LearnerConfig
 from space_dist.envs import Observations
 from space_dist.envs.observations import concatenate, each, put, rows
 from space_dist.learner.interface import SB3Learner, schedule
@@ -52,7 +52,7 @@ class OnPolicyLearner(SB3Learner):
 
     def __init__(
         self,
-        config: PPOConfig | TRPOConfig | A2CConfig,
+        config: LearnerConfig,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
         *,
@@ -89,7 +89,7 @@ class OnPolicyLearner(SB3Learner):
     @property
     def _compiled(self) -> bool:
         """Whether updates, and what they need, are computed by our kernel."""
-        return isinstance(self._settings, PPOConfig) and self._settings.update == "lean"
+        return self._settings.is_compiled("single")
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         return {"policy": self.model.policy.optimizer}

@@ -13,16 +13,12 @@ from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.instances import read_csv
 from space_dist.learner import SB3Learner
+from space_dist.learner.networks import ALGORITHMS
 from space_dist.ledger import Checkpoint, Ledger
 from space_dist.rollout.policy import OBSERVATION_CLIP
 from space_dist.run.building import learner_of, spec_of
 from space_dist.run.launch import stored_config
 from space_dist.sb3 import ContextVecEnv
-
-_ALGORITHMS = {
-    "ppo": "stable_baselines3.PPO", "a2c": "stable_baselines3.A2C", "dqn": "stable_baselines3.DQN",
-    "sac": "stable_baselines3.SAC", "td3": "stable_baselines3.TD3", "trpo": "sb3_contrib.TRPO",
-}  # fmt: skip
 
 
 def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
@@ -39,7 +35,7 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
         raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
     out = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
     spec = spec_of(config)
-    kind, written = _ALGORITHMS[config.learner.kind], []
+    written = []
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for member in range(config.members):
@@ -48,7 +44,7 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
             model: Any = learner.model
             model.num_timesteps = int(checkpoint.data["run"]["steps"])
             model.save(path)
-            written.append((path, f"{kind}.load takes it"))
+            written.append((path, f"{_importable(config)}.load takes it"))
             if learner.normalises:
                 beside = out.with_name(f"{out.stem}_vecnormalize.pkl")
                 _normaliser(config, spec, ledger, learner).save(str(beside))
@@ -56,6 +52,12 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
     except OSError as error:
         raise ConfigError(f"{out} cannot be written: {error.strerror}") from None
     return written
+
+
+def _importable(config: RunConfig) -> str:
+    """How a script imports the class of a run's algorithm, of SB3 or sb3-contrib."""
+    algorithm = ALGORITHMS[config.learner.kind]
+    return f"{algorithm.__module__.partition('.')[0]}.{algorithm.__name__}"
 
 
 def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpoint, member: int) -> SB3Learner:
