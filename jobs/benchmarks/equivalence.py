@@ -38,8 +38,8 @@ POWER = 0.9  # where there is no difference
 PILOT = range(9000, 9024)
 BATCH_SIZE = 512  # transitions: 40 gradient steps an update; with 320, SB3 takes hours of a core
 CONFIDENCE = 0.9  # in the limit of the pilot's standard deviation
-ARMS = {"sb3": 6000, "population": 7000, "control": 8000}  # their first seeds
-FEWEST, MOST = 10, 200  # seeds per arm
+ARMS = {"sb3": 16000, "population": 17000, "control": 18000}  # their first seeds
+FEWEST, MOST = 60, 200  # seeds per arm
 console = Console()
 
 
