@@ -29,7 +29,7 @@ from space_dist.config.curriculum import (
     ValueDisagreementConfig,
 )
 from space_dist.config.explaining import schema
-from space_dist.config.identities import NOT_IDENTITY, differences, flattened, identity
+from space_dist.config.identities import NOT_IDENTITY, changes, differences, flattened, identity
 from space_dist.config.learner import (
     A2CConfig,
     DQNConfig,
@@ -95,6 +95,7 @@ __all__ = [
     "UniformConfig",
     "ValueDisagreementConfig",
     "apply_override",
+    "changes",
     "check",
     "clean",
     "differences",

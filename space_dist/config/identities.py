@@ -35,16 +35,21 @@ def identity(
 def differences(one: RunConfig, other: RunConfig) -> list[str]:
     """`key: value -> value` for every key that decides results and differs; instance paths are left out."""
     exclude = {*NOT_IDENTITY, "instances"}
-    left = dict(flattened(one.model_dump(mode="json", exclude=exclude)))
-    right = dict(flattened(other.model_dump(mode="json", exclude=exclude)))
-    return [f"{key}: {left.get(key)} -> {right.get(key)}" for key in sorted({*left, *right})
-            if left.get(key) != right.get(key)]  # fmt: skip
+    changed = changes(one.model_dump(mode="json", exclude=exclude), other.model_dump(mode="json", exclude=exclude))
+    return [f"{key}: {before} -> {after}" for key, (before, after) in changed.items()]
 
 
-def flattened(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(`section.key`, value) of everything in nested settings; of an empty section nothing."""
+def changes(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """`section.key` -> its two values, sorted, where nested settings differ; None: it is not there."""
+    left, right = dict(flattened(one)), dict(flattened(other))
+    keys = sorted({*left, *right})
+    return {key: (left.get(key), right.get(key)) for key in keys if left.get(key) != right.get(key)}
+
+
+def flattened(data: Mapping[str, Any], prefix: str = "", *, empty: bool = False) -> Iterator[tuple[str, Any]]:
+    """(`section.key`, value) of everything in nested settings; of an empty section nothing, or with `empty` itself."""
     for key, value in data.items():
-        if isinstance(value, Mapping):
-            yield from flattened(value, f"{prefix}{key}.")
+        if isinstance(value, Mapping) and (value or not empty):
+            yield from flattened(value, f"{prefix}{key}.", empty=empty)
         else:
             yield f"{prefix}{key}", value

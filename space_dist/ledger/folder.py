@@ -48,6 +48,10 @@ class Status:
     fingerprint_changed: bool = False  # resumed where bit-equality is not promised
     format: int = FORMAT
 
+    def is_final(self, evaluated_at: int) -> bool:
+        """Whether an evaluation after so many steps tells a run's final numbers: of the policy it finished with."""
+        return self.state == "done" and bool(evaluated_at == self.steps)
+
 
 class Ledger:
     """The one class that knows the paths of a run. Reading needs no lock; writing is `RunWriter`'s."""
