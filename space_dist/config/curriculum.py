@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from space_dist.config.sections import MAX_LIST, Section, refuse_library
+from space_dist.config.sections import MAX_LIST, Section, own_path
 
 
 class _Curriculum(Section):
@@ -397,9 +397,7 @@ class CustomConfig(_Curriculum):
     @field_validator("import_path")
     @classmethod
     def _of_your_own(cls, value: str) -> str:
-        if not all(value.partition(":")):
-            raise ValueError("must be an import path with a colon, like my_package.my_module:MyCurriculum")
-        return refuse_library(value)
+        return own_path(value, "MyCurriculum")
 
     @property
     def may_probe(self) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from space_dist.config.sections import Section, refuse_library
+from space_dist.config.sections import Section, own_path, refuse_library
 from space_dist.errors import nearest
 
 
@@ -23,6 +23,11 @@ class _Learner(Section):
     policy: str = Field(default="MlpPolicy", min_length=1, max_length=300)
     """SB3's MlpPolicy (acts in NumPy, without torch), CnnPolicy (images), MultiInputPolicy (dictionaries), or the
     import path of a policy class (my_package.my_module:MyPolicy)."""
+    import_path: str | None = Field(default=None, alias="import", min_length=1, max_length=300)
+    """Import path (my_package.my_module:MyPPO) of a learner of your own: a class derived from Stable-Baselines3's of
+    this kind (docs/your_learner.md). null: Stable-Baselines3's."""
+    kwargs: dict[str, bool | int | float | str] = Field(default={})
+    """Arguments that your own class has beside Stable-Baselines3's, by name."""
     learning_rate_schedule: Literal["constant", "linear"] = "constant"
     """`linear` falls to 0 at the end of the budget."""
     gamma: float = Field(default=0.95, ge=0.0, le=1.0)
@@ -46,6 +51,17 @@ class _Learner(Section):
             )
         return refuse_library(value)
 
+    @field_validator("import_path")
+    @classmethod
+    def _of_your_own(cls, value: str | None) -> str | None:
+        return None if value is None else own_path(value, "MyPPO")
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """Import paths of what somebody else has written."""
+        named = (self.policy, self.import_path)
+        return tuple(path for path in named if path is not None and ":" in path)
+
     @property
     def episodes_per_round(self) -> int | None:
         """Episodes that end a round, where steps do not."""
@@ -63,6 +79,14 @@ class _Learner(Section):
     def _lean_knows_mlps_only(self) -> Self:
         if getattr(self, "update", "stock") == "lean" and self.policy != "MlpPolicy":
             raise ValueError(f"update: lean knows MlpPolicy only, not {self.policy}; allowed with it: stock")
+        return self
+
+    @model_validator(mode="after")
+    def _own_updates_are_its_own(self) -> Self:
+        if self.import_path is not None and getattr(self, "update", "stock") == "lean":
+            raise ValueError("update: lean is Stable-Baselines3's update, compiled; with import it must be stock")
+        if self.import_path is None and self.kwargs:
+            raise ValueError("kwargs are arguments of your own class, which import names; it names none")
         return self
 
 

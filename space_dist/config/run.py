@@ -81,6 +81,10 @@ class RunConfig(Section):
                 f"learner.update: {self.learner.update} says nothing with engine: population, which has updates of its "
                 "own; use engine: single"
             )
+        if self.engine == "population" and self.learner.import_path is not None:
+            raise ValueError(
+                "learner.import says nothing with engine: population, which has updates of its own; use engine: single"
+            )
         return self
 
     @model_validator(mode="after")
@@ -89,6 +93,11 @@ class RunConfig(Section):
             return self
         if self.engine == "single" or not self.learner.can_be_stacked:
             raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo or trpo")
+        if self.learner.import_path is not None:
+            raise ValueError(
+                "curriculum.aggregate: population needs engine: population, which has updates of its own, and so none "
+                "for a class that learner.import names"
+            )
         if self.learner.normalize_observations or self.learner.normalize_rewards:
             raise ValueError(
                 "curriculum.aggregate: population cannot be combined with learner.normalize_observations or "
@@ -125,9 +134,9 @@ class RunConfig(Section):
 
     @property
     def import_paths(self) -> tuple[str, ...]:
-        """What names code of somebody's own, which results depend on as well: environment, policy and curriculum."""
-        named = (self.env.id, self.learner.policy, *self.curriculum.import_paths)
-        return tuple(path for path in named if ":" in path)
+        """What names code of somebody's own, which results depend on: environment, policy, learner and curriculum."""
+        of_env = (self.env.id,) if ":" in self.env.id else ()
+        return (*of_env, *self.learner.import_paths, *self.curriculum.import_paths)
 
     @property
     def n_episodes(self) -> int | None:

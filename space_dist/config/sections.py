@@ -30,6 +30,13 @@ def refuse_library(value: str) -> str:
     return value
 
 
+def own_path(value: str, like: str) -> str:
+    """An import path of somebody's own. `like`: a name for the sentence that any other word is refused with."""
+    if not all(value.partition(":")):
+        raise ValueError(f"must be an import path with a colon, like my_package.my_module:{like}")
+    return refuse_library(value)
+
+
 class EnvConfig(Section):
     """The environment."""
 

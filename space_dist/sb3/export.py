@@ -39,7 +39,8 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
         raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
     out = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
     spec = spec_of(config)
-    kind, written = _ALGORITHMS[config.learner.kind], []
+    own, written = config.learner.import_path, []
+    kind = _ALGORITHMS[config.learner.kind] if own is None else own.replace(":", ".")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         for member in range(config.members):
