@@ -628,6 +628,7 @@ OTHER_WORDS = {
     "resources.address": "auto",
     "curriculum.column": "effort",
     "curriculum.import": "my_package.my_module:Other",
+    "learner.import": "my_package.my_module:Other",
 }
 # What decides no result, and so is no part of a run's identity: when it is saved, where it is mirrored, what it runs
 # on, and where its instance files lie (their content enters by digest).

@@ -26,7 +26,7 @@ from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, R
 from space_dist.experiment.status import Attempts
 from space_dist.ledger import METRICS, TIMING, Ledger, Lock, RunWriter
 from space_dist.tracking import NOTE_TAG, TrackingError, find, follow, sync
-from space_dist.tracking.grids import final_return
+from space_dist.tracking.grids import final_return, last_evaluation
 from tests.grids import ROOT
 from tests.test_report import GROWTH, STARTED, continue_run, start_run
 from tests.test_tracking import contents, histories
@@ -386,13 +386,19 @@ def test_long_results_are_cut_in_the_description_and_whole_beside_it(uri: str, t
 
 def test_the_last_evaluation_is_read_from_the_end(tmp_path: Path) -> None:
     ledger = start_run(tmp_path / "run")
+    assert last_evaluation(ledger, ledger.status()) is None
     assert final_return(ledger, ledger.status()) is None
     continue_run(ledger, [float(n) for n in range(400)], [[0]] * 399)  # several blocks
-    assert ledger.status().committed[METRICS] > 3 * (64 << 10)
-    assert final_return(ledger, ledger.status()) == 399.0
+    status = ledger.status()
+    assert status.committed[METRICS] > 3 * (64 << 10)
+    assert final_return(ledger, status) == 399.0
+    assert final_return(ledger, dataclasses.replace(status, state="interrupted")) is None
+    assert final_return(ledger, dataclasses.replace(status, steps=status.steps + 1)) is None  # not evaluated at the end
     half = dataclasses.replace(ledger.status(), committed={METRICS: 100 << 10})
     rows = (ledger.folder / METRICS).read_bytes()[: 100 << 10].splitlines()
-    assert final_return(ledger, half) == float(sum(b'"evaluation"' in line for line in rows[:-1]) - 1)
+    row = last_evaluation(ledger, half)
+    assert row is not None
+    assert row["test"]["return"] == float(sum(b'"evaluation"' in line for line in rows[:-1]) - 1)
 
 
 def test_damaged_runs_are_named_and_the_others_mirrored(uri: str, tmp_path: Path) -> None:

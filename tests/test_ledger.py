@@ -25,7 +25,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from space_dist import ledger as module
 from space_dist.errors import LedgerError, RunLockedError
 from space_dist.ledger import (
     CURRICULUM,
@@ -44,6 +43,8 @@ from space_dist.ledger import (
     encode_row,
     find_ledgers,
 )
+from space_dist.ledger import checkpoint as checkpoints
+from space_dist.ledger import lock as locks
 from tests.faults.injection import Disk, Kills
 from tests.patience import PATIENCE
 
@@ -275,7 +276,7 @@ def test_a_missing_or_unreadable_status_is_an_error(tmp_path: Path) -> None:
 def test_a_newer_format_is_named(ledger: Ledger, monkeypatch: pytest.MonkeyPatch, extra: dict[str, Any]) -> None:
     with monkeypatch.context() as patch, RunWriter(ledger) as writer:
         as_dict = dataclasses.asdict
-        patch.setattr(module.dataclasses, "asdict", lambda status: {**as_dict(status), **extra})
+        patch.setattr(dataclasses, "asdict", lambda status: {**as_dict(status), **extra})
         writer.set_status(status_of(3, format=3))
     with pytest.raises(LedgerError, match="format 3; this version reads formats 1 and 2"):
         ledger.status()
@@ -327,7 +328,7 @@ def test_checkpoints_come_back_bit_by_bit(round: int, named: dict[str, np.ndarra
 def forged(name: str = "array/weights", **changes: Any) -> bytes:
     """A checkpoint whose hashes are right, and whose names or numbers are those of somebody who means ill."""
     array, meta = np.zeros(3), {"round": 1, "data": {}, "segments": [], "format": 1, **changes}
-    meta["sha256"] = module._digest(meta, {name.removeprefix("array/"): array})
+    meta["sha256"] = checkpoints._digest(meta, {name.removeprefix("array/"): array})
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for member, content in (("meta", np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8)), (name, array)):
@@ -744,7 +745,7 @@ def test_a_disk_that_refuses_is_told_in_one_sentence(
         writer.restore()
         append_round(writer, 4)
         with monkeypatch.context() as patch:
-            patch.setattr(module.os, where, failing_to_write(number) if where == "open" else failing(number))
+            patch.setattr(os, where, failing_to_write(number) if where == "open" else failing(number))
             with pytest.raises(LedgerError) as caught:
                 WRITES[write](writer)
         assert said in str(caught.value)
@@ -758,7 +759,7 @@ def test_rows_on_a_disk_that_refuses(ledger: Ledger, monkeypatch: pytest.MonkeyP
     with RunWriter(ledger) as writer:
         writer.restore()
         with monkeypatch.context() as patch:
-            patch.setattr(module.os, "open", failing(number))
+            patch.setattr(os, "open", failing(number))
             with pytest.raises(LedgerError, match=said):
                 write_rounds(writer, 4, 4)
     assert restored(ledger) == 3
@@ -780,7 +781,7 @@ def test_a_commit_that_failed_can_be_made_again(ledger: Ledger, monkeypatch: pyt
             append_round(writer, number)
             calls[0] = number - 3  # which call fails
             with monkeypatch.context() as patch:
-                patch.setattr(module.os, "fsync", sometimes)
+                patch.setattr(os, "fsync", sometimes)
                 try:
                     writer.commit(checkpoint_of(number), status_of(number))
                 except LedgerError:
@@ -934,7 +935,7 @@ with RunWriter(Ledger(sys.argv[1])) as writer, writer._lock.held():
 
 
 def test_an_owner_stopped_in_a_write_is_told_in_a_sentence(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CLAIM_SECONDS", 0.1)
+    monkeypatch.setattr(locks, "CLAIM_SECONDS", 0.1)
     process = subprocess.Popen(
         [sys.executable, "-c", HOLD_IN_A_WRITE, str(ledger.folder)], stdout=subprocess.PIPE, text=True
     )
@@ -951,8 +952,8 @@ def test_an_owner_stopped_in_a_write_is_told_in_a_sentence(ledger: Ledger, monke
 
 
 def test_a_lock_that_a_stranger_holds_is_told_in_a_sentence(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CLAIM_SECONDS", 0.1)
-    monkeypatch.setattr(module, "OWNER_SECONDS", 0.1)
+    monkeypatch.setattr(locks, "CLAIM_SECONDS", 0.1)
+    monkeypatch.setattr(locks, "OWNER_SECONDS", 0.1)
     with ledger.lock_file.open("rb") as stranger:
         fcntl.flock(stranger, fcntl.LOCK_EX)
         with pytest.raises(RunLockedError, match=r"cannot claim .*held its lock for 0 s \(`fuser"), RunWriter(ledger):
@@ -978,7 +979,7 @@ def test_only_the_owners_user_can_take_the_lock(ledger: Ledger, tmp_path: Path) 
 
 
 def test_a_lock_that_cannot_be_read_is_judged_by_its_age(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_owner", failing(errno.EACCES))
+    monkeypatch.setattr(locks, "_owner", failing(errno.EACCES))
     assert ledger.owner_alive()
     os.utime(ledger.lock_file, (time.time(), time.time() - LEASE_SECONDS - 1))
     assert not ledger.owner_alive()
@@ -1209,7 +1210,7 @@ def test_of_many_that_race_for_a_dead_owners_run_one_wins(ledger: Ledger, trial:
 
 
 def test_the_owner_keeps_its_lease(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "HEARTBEAT_SECONDS", 0.02)
+    monkeypatch.setattr(locks, "HEARTBEAT_SECONDS", 0.02)
     with RunWriter(ledger):
         first = lock_of(ledger)["heartbeat"]
         deadline = time.monotonic() + PATIENCE

@@ -152,7 +152,7 @@ def test_its_source_is_part_of_what_a_run_is(example: Path) -> None:
     assert (planned.new_runs, again.new_runs, again.dropped_runs) == (1, 1, 1)
     launch(chosen(), example / "run", resume=True, stop=StopRequests())
     assert Ledger(example / "run").status().fingerprint_changed
-    assert "that of your own environment, policy or curriculum" in (example / "run/log.txt").read_text()
+    assert "that of your own environment, policy, learner or curriculum" in (example / "run/log.txt").read_text()
 
 
 def test_columns_of_the_instances_reach_it(example: Path) -> None:

@@ -26,17 +26,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
-import numpy as np
 import psutil
 import requests
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.faults import KINDS, LAST, OF_ALL, Fault, Hit, Result, plan
+from benchmarks.processes import MARK, in_words, is_hit, is_live, is_named, left_of_ours, marked
 from benchmarks.servers import RayHead, TrackingServer, until
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError, nearest
@@ -46,12 +47,6 @@ from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, Status
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPARED = (METRICS, CURRICULUM, "model.npz")
-KINDS = (
-    "kill rollout actor", "stop rollout actor", "kill curriculum actor", "stop curriculum actor", "kill driver",
-    "stop driver", "kill supervisor", "stop supervisor", "kill pool worker", "stop pool worker", "kill conductor",
-    "kill submitter", "kill Ray head", "kill tracking server",
-)  # fmt: skip
-OF_ALL = ("conductor", "submitter", "Ray head", "tracking server")  # parts that all runs share
 AT_A_TIME = 2  # runs, each with a driver, a rollout actor and a curriculum actor
 BASE = ROOT / "configs/pointmass_space.yaml"
 SETTINGS: Mapping[str, Any] = {
@@ -60,68 +55,11 @@ SETTINGS: Mapping[str, Any] = {
     "rollout.slots": 2,
     "evaluation.every_steps": 10_240,
 }
-_FIRST, _LAST = 0.03, 0.9  # of all steps: when the first and the last fault may fall
-_MOST_DELAY, _MOST_PAUSE = 2.0, 3.0  # seconds: after the step count that calls for a fault; before a restart
 _FURTHER_ROUNDS = 2  # that a run must commit after a fault: the first may have been computed when it fell
 _SEARCH_SECONDS = 240.0  # for a target
 _RECOVERY_SECONDS = 240.0
 _LEFT_SECONDS = 45.0  # for what was told to end
-_MARK = "SPACE_DIST_CHAOS"  # in the environment of every process that belongs to one rehearsal
 console = Console()
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One of KINDS. It falls `delay` seconds after `after_steps` were committed by all runs together.
-
-    choice: in [0, 1), which of the possible victims. pause: seconds before whoever has to be restarted is.
-    """
-
-    kind: str
-    after_steps: float
-    delay: float
-    pause: float
-    choice: float
-
-
-@dataclass(frozen=True)
-class Hit:
-    """A fault that fell. seconds: until everything that was at work had got on; None if it did not."""
-
-    fault: Fault
-    run: str
-    at: float
-    seconds: float | None
-
-
-@dataclass
-class Result:
-    """What a rehearsal has shown."""
-
-    hits: list[Hit] = field(default_factory=list)
-    misses: dict[str, int] = field(default_factory=dict)
-    faults: list[str] = field(default_factory=list)  # what is not as it must be, one sentence each
-    runs: int = 0
-    identical: int = 0
-    ends: dict[str, int] = field(default_factory=dict)  # how attempts ended
-    submissions: int = 0
-    seconds: float = 0.0
-
-
-def plan(kinds: Sequence[str], count: int, steps: int, seed: int, last: float = _LAST) -> list[Fault]:
-    """`count` faults over a grid of `steps` environment steps, every kind as often as any other, give or take one.
-
-    last: by which share of the steps all have fallen.
-    """
-    draws = np.random.default_rng(np.random.SeedSequence(seed))
-    chosen = [kinds[number % len(kinds)] for number in range(count)]
-    draws.shuffle(chosen)
-    moments = np.sort(draws.uniform(_FIRST * steps, last * steps, count))
-    return [
-        Fault(kind, float(moment), float(draws.uniform(0.0, _MOST_DELAY)), float(draws.uniform(0.0, _MOST_PAUSE)),
-              float(draws.random()))
-        for kind, moment in zip(chosen, moments, strict=True)
-    ]  # fmt: skip
 
 
 def chaos(
@@ -154,7 +92,7 @@ def chaos(
 
 def rehearse(
     *, runs: int, steps: int, seed: int, kinds: Sequence[str], count: int, say: Callable[[str], None],
-    base: Path = BASE, settings: Mapping[str, Any] = SETTINGS, last: float = _LAST,
+    base: Path = BASE, settings: Mapping[str, Any] = SETTINGS, last: float = LAST,
     after_faults: Callable[[], None] = lambda: None,
 ) -> Result:  # fmt: skip
     """Work on one grid twice, once left alone and once not; returns what was found.
@@ -166,7 +104,7 @@ def rehearse(
     folder = Path(tempfile.mkdtemp(prefix="sd", dir="/tmp"))
     (folder / "tmp").mkdir()
     environment = {
-        **os.environ, _MARK: mark, "TMPDIR": str(folder / "tmp"), "RAY_TMPDIR": str(folder / "tmp"),
+        **os.environ, MARK: mark, "TMPDIR": str(folder / "tmp"), "RAY_TMPDIR": str(folder / "tmp"),
         "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
     }  # fmt: skip
     result = Result(runs=runs)
@@ -186,14 +124,14 @@ def rehearse(
                 rehearsal.check(_finished(alone, folder))
             finally:
                 rehearsal.end()
-        until(lambda: not _marked(mark), _LEFT_SECONDS)
-        if left := _marked(mark):  # the servers have ended, too
-            result.faults.append(f"left behind in the end: {'; '.join(map(_in_words, left))}")
+        until(lambda: not marked(mark), _LEFT_SECONDS)
+        if left := marked(mark):  # the servers have ended, too
+            result.faults.append(f"left behind in the end: {'; '.join(map(in_words, left))}")
         until(lambda: not _temporary(folder / "tmp"), _LEFT_SECONDS)  # a large folder is removed after its owner's end
         if names := _temporary(folder / "tmp"):
             result.faults.append(f"temporary files were left behind: {', '.join(names)}")
     finally:
-        for process in _marked(mark):
+        for process in marked(mark):
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
         if result.faults:
@@ -283,7 +221,7 @@ class _Open:
 
     def over(self, has_got_on: Callable[[_Live, bool], bool]) -> bool:
         """The victims are gone, and whatever was at work has got on."""
-        return not any(map(_is_live, self.victims)) and all(has_got_on(one, one in self.moved) for one in self.live)
+        return not any(map(is_live, self.victims)) and all(has_got_on(one, one in self.moved) for one in self.live)
 
 
 class _Rehearsal:
@@ -419,7 +357,7 @@ class _Rehearsal:
             status = self._status(run)
             if status is not None and status.state == "running" and 0 < status.steps < status.budget_steps:
                 driver = self._driver(self._grid.ledger(run))
-                if driver is None or not _is(driver, "space_dist.grid.supervisor"):
+                if driver is None or not is_named(driver, "space_dist.grid.supervisor"):
                     continue
                 if status.round > self._first_seen.setdefault((run.key, driver), status.round):
                     found.append(_Live(run, status.round, driver))
@@ -453,14 +391,14 @@ class _Rehearsal:
     def _hit(self, fault: Fault, chosen: _Live, live: Sequence[_Live]) -> None:
         verb, name = fault.kind.split(" ", 1)
         victims, moved, restart = self._victims(name, chosen, live)
-        if not victims or not all(map(_is_live, victims)):
+        if not victims or not all(map(is_live, victims)):
             raise _Missed
         start = time.monotonic()
         for victim in victims:
             victim.send_signal(signal.SIGSTOP if verb == "stop" else signal.SIGKILL)
         if name in ("conductor", "submitter", "Ray head"):
             self._expected += 1
-        fell = until(lambda: all(_is_hit(victim, verb) for victim in victims), 5.0, 0.02)
+        fell = until(lambda: all(is_hit(victim, verb) for victim in victims), 5.0, 0.02)
         counts = fell and any(
             (status := self._status(one.run)) is not None and status.state == "running"
             for one in (live if name in OF_ALL else [chosen])
@@ -488,7 +426,7 @@ class _Rehearsal:
     ) -> tuple[list[psutil.Process], Sequence[_Live], Callable[[], None] | None]:
         """The processes to hit, the runs that go on in another process then, and what has to be restarted."""
         driver, supervisor, sharing = chosen.driver, chosen.driver.parent(), _sharing(chosen, live)
-        if supervisor is None or not _is(supervisor, "space_dist.grid.supervisor"):
+        if supervisor is None or not is_named(supervisor, "space_dist.grid.supervisor"):
             raise _Missed
         if name.endswith("actor"):
             kind = {"rollout actor": "RolloutActor", "curriculum actor": "CurriculumActor"}[name]
@@ -497,7 +435,7 @@ class _Rehearsal:
             return [driver if name == "driver" else supervisor], sharing, None
         if name == "pool worker":
             worker = supervisor.parent()
-            if worker is None or not _is(worker, "ray::PoolWorker"):
+            if worker is None or not is_named(worker, "ray::PoolWorker"):
                 raise _Missed
             return [worker], sharing, None
         if name == "conductor":
@@ -526,12 +464,12 @@ class _Rehearsal:
         if len(pids) != 1 or not pids[0]:
             raise _Missed
         process = psutil.Process(int(pids[0]))
-        if not _is(process, f"ray::{kind}"):
+        if not is_named(process, f"ray::{kind}"):
             raise _Missed
         return process
 
     def _conductor(self) -> psutil.Process:
-        for process in _marked(self._mark):
+        for process in marked(self._mark):
             with contextlib.suppress(psutil.Error):
                 words = process.cmdline()
                 if "manifest.json" in words and str(self._grid.folder.parent) in words and "grid" in words:
@@ -563,8 +501,8 @@ class _Rehearsal:
         for lock in [self._grid.lock_file, *(self._grid.ledger(run).lock_file for run in self._all())]:
             if not json.loads(lock.read_bytes()).get("released"):
                 faults.append(f"a lock is still held: {lock.relative_to(self._folder)}")
-        until(lambda: not _left(self._mark), _LEFT_SECONDS)
-        if left := _left(self._mark):
+        until(lambda: not left_of_ours(self._mark), _LEFT_SECONDS)
+        if left := left_of_ours(self._mark):
             faults.append(f"left behind when the grid was done: {left}")
 
     def _mirror_faults(self) -> Iterator[str]:
@@ -608,52 +546,6 @@ def _points(ledger: Ledger) -> Iterator[tuple[str, int, int, float]]:
 
 def _same(one: Path, other: Path) -> bool:
     return one.exists() and filecmp.cmp(one, other, shallow=False)
-
-
-# ---- processes ------------------------------------------------------------------------------------------------------
-
-
-def _is(process: psutil.Process, word: str) -> bool:
-    with contextlib.suppress(psutil.Error):
-        return any(word in part for part in process.cmdline())
-    return False
-
-
-def _is_live(process: psutil.Process) -> bool:
-    with contextlib.suppress(psutil.Error):
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    return False
-
-
-def _is_hit(process: psutil.Process, verb: str) -> bool:
-    if verb == "kill":
-        return not _is_live(process)
-    with contextlib.suppress(psutil.Error):
-        return process.status() == psutil.STATUS_STOPPED
-    return False
-
-
-def _marked(mark: str) -> list[psutil.Process]:
-    """Every process of a rehearsal: an environment is inherited by whatever is started, on whatever detour."""
-    found = []
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            if process.status() != psutil.STATUS_ZOMBIE and process.environ().get(_MARK) == mark:
-                found.append(process)
-    return found
-
-
-def _left(mark: str) -> str:
-    """Processes of ours, or that work for us, in words; Ray's own, its idle workers and MLflow's are not."""
-    ours = ("-m space_dist", "ray::RolloutActor", "ray::CurriculumActor", "ray::PoolWorker")
-    lines = map(_in_words, _marked(mark))
-    return "; ".join(line for line in lines if any(word in line for word in ours))
-
-
-def _in_words(process: psutil.Process) -> str:
-    with contextlib.suppress(psutil.Error):
-        return f"{process.pid} {' '.join(process.cmdline())[:150]}"
-    return f"{process.pid}"
 
 
 def _show(result: Result) -> None:

@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import Logger
 
 from space_dist.config import LearnerConfig
 from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.learner import custom
 from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
 from space_dist.learner.normaliser import Normaliser
 from space_dist.rollout import Shard
@@ -277,7 +278,13 @@ class SB3Learner(abc.ABC):
                         numbers[f"{kind}/{index}/{name}"] = value
         if self._normaliser is not None:
             arrays |= {f"normaliser/{name}": array for name, array in self._normaliser.save().items()}
-        return arrays, {"n_updates": self.model._n_updates, "optimizer_numbers": numbers}
+        data = {"n_updates": self.model._n_updates, "optimizer_numbers": numbers}
+        if self._config.import_path is None:
+            return arrays, data
+        with _seeded(self._seed, Purpose.INITIAL_NETWORK):
+            twin = self._build(self.model.observation_space, self.model.action_space)
+        columns, own = custom.saved(self.model, twin, self._config)
+        return {**arrays, **{f"own/{name}": array for name, array in columns.items()}}, {**data, "own": own}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
         """See `Learner`."""
@@ -302,6 +309,11 @@ class SB3Learner(abc.ABC):
                 {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
             )
         self.model._n_updates = int(data["n_updates"])
+        if self._config.import_path is not None:
+            columns = {
+                name.removeprefix("own/"): array.copy() for name, array in arrays.items() if name.startswith("own/")
+            }
+            custom.load({**columns, **data["own"]}, self.model, self._config)
 
     def transitions(self, first: int) -> Arrays:  # noqa: ARG002 - the signature of those that have a buffer
         """See `Learner`."""
@@ -343,6 +355,7 @@ def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], a
     kind = config.kind
     flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
     refuse_policy(config, observation_space)
+    custom.algorithm_class(config)
     if config.normalize_observations and not flat:
         raise ConfigError("learner.normalize_observations: only flat observations can be normalised")
     continuous = isinstance(action_space, spaces.Box) and len(action_space.shape) == 1

@@ -16,16 +16,17 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from space_dist.config import DQNConfig, SACConfig, TD3Config
 from space_dist.envs import Observations
 from space_dist.envs.observations import each, put, take
+from space_dist.learner.custom import algorithm_class, made, set_up
 from space_dist.learner.interface import Arrays, SB3Learner, schedule
 from space_dist.learner.lean_replay import LEAN
-from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs
+from space_dist.learner.networks import bounds, layers, policy_class, policy_kwargs
 from space_dist.rollout import Shard
 from space_dist.rollout.policy import Exploration, Head, MlpPolicy, Statistics
 
 _OURS = {
     "kind", "policy", "n_steps", "n_episodes", "learning_rate", "learning_rate_schedule", "net_arch", "activation",
     "log_std_init", "gradient_steps_per_step", "action_noise_std", "scored_network",
-    "normalize_observations", "normalize_rewards", "update",
+    "normalize_observations", "normalize_rewards", "update", "import_path", "kwargs",
 }  # fmt: skip
 
 
@@ -56,8 +57,10 @@ class OffPolicyLearner(SB3Learner):
             settings["max_grad_norm"] = float("inf")
         if isinstance(config, SACConfig):  # SB3's "auto" asks an environment for this number
             settings["target_entropy"] = float(-np.prod(action_space.shape or ()))
-        algorithm = (LEAN if config.update == "lean" else ALGORITHMS)[config.kind]
-        model: Any = algorithm(
+        algorithm = LEAN[config.kind] if config.update == "lean" else algorithm_class(config)
+        model: Any = made(
+            algorithm,
+            config,
             policy_class(config),
             env=None,
             learning_rate=schedule(config.learning_rate, config.learning_rate_schedule),
@@ -67,7 +70,7 @@ class OffPolicyLearner(SB3Learner):
             **settings,
         )
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, 1
-        model._setup_model()
+        set_up(model, config)
         off_policy: OffPolicyAlgorithm = model
         return off_policy
 

@@ -16,15 +16,16 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from space_dist.config import LearnerConfig
 from space_dist.envs import Observations
 from space_dist.envs.observations import concatenate, each, put, rows
+from space_dist.learner.custom import algorithm_class, made, set_up
 from space_dist.learner.interface import SB3Learner, schedule
 from space_dist.learner.lean import LeanPPO
-from space_dist.learner.networks import ALGORITHMS, bounds, layers, policy_class, policy_kwargs, tensors
+from space_dist.learner.networks import bounds, layers, policy_class, policy_kwargs, tensors
 from space_dist.rollout import Shard
 from space_dist.rollout.policy import Head, MlpPolicy, Statistics
 
 _OURS = {
     "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation", "log_std_init",
-    "normalize_observations", "normalize_rewards", "update",
+    "normalize_observations", "normalize_rewards", "update", "import_path", "kwargs",
 }  # fmt: skip
 
 
@@ -70,8 +71,10 @@ class OnPolicyLearner(SB3Learner):
         settings = {name: value for name, value in dict(config).items() if name not in _OURS}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
             settings["max_grad_norm"] = float("inf")
-        algorithm: Any = LeanPPO if self._compiled else ALGORITHMS[config.kind]
-        model = algorithm(
+        algorithm: Any = LeanPPO if self._compiled else algorithm_class(config)
+        model = made(
+            algorithm,
+            config,
             policy_class(config),
             env=None,
             n_steps=self._slot_length,
@@ -82,7 +85,7 @@ class OnPolicyLearner(SB3Learner):
             **settings,
         )
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, self._n_slots
-        model._setup_model()
+        set_up(model, config)
         on_policy: OnPolicyAlgorithm = model
         return on_policy
 

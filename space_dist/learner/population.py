@@ -160,6 +160,8 @@ def refuse(config: LearnerConfig, observation_space: spaces.Space[Any], action_s
         raise ConfigError(f"engine: population learns with learner.kind: {able}, not {config.kind}")
     if config.policy != "MlpPolicy":
         raise ConfigError(f"engine: population learns with learner.policy: MlpPolicy, not {config.policy}")
+    if config.import_path is not None:
+        raise ConfigError("engine: population has updates of its own; a class that learner.import names needs single")
     if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
         raise ConfigError(
             f"engine: population needs flat observations (a one-dimensional Box), not {observation_space}"

@@ -424,8 +424,8 @@ def _run_numbers(grid: Grid, cells: Sequence[CellRuns]) -> list[dict[str, Value]
                 "cell": cell.cell.id, "label": cell.label, "seed": standing.run.seed, "condition": standing.condition,
                 "cause": standing.cause, "detail": " / ".join(clean(line) for line in standing.detail.splitlines()),
                 "attempts": standing.attempts, "steps": standing.steps, "budget_steps": standing.budget_steps,
-                "last_test_return": None if last is None else last.final("test", "return"),
-                "last_train_return": None if last is None else last.final("train", "return"),
+                "last_test_return": None if last is None else last.last("test", "return"),
+                "last_train_return": None if last is None else last.last("train", "return"),
                 "fingerprint_changed": None if run is None else str(run.status.fingerprint_changed).lower(),
                 "folder": run_folder(grid, standing),
             }  # fmt: skip

@@ -60,7 +60,7 @@ class Run:
     @property
     def evaluated_at_end(self) -> bool:
         """Whether the run is finished and its last evaluation was of the policy it finished with."""
-        return self.finished and len(self.evaluation_steps) > 0 and self.evaluation_steps[-1] == self.status.steps
+        return len(self.evaluation_steps) > 0 and self.status.is_final(self.evaluation_steps[-1])
 
     @property
     def trained(self) -> tuple[IntArray, ...]:
@@ -86,8 +86,11 @@ class Run:
             return tuple((int(row["steps"]), dict(row["curriculum"])) for row in _rows(self.ledger, METRICS)
                          if row.get("kind") == "iteration" and row["curriculum"])  # fmt: skip
 
-    def final(self, split: Split, measure: str) -> float:
-        """The last evaluation's mean over the split. Raises LedgerError if nothing was evaluated yet."""
+    def last(self, split: Split, measure: str) -> float:
+        """The last evaluation's mean over the split: final, if `evaluated_at_end`.
+
+        Raises LedgerError if nothing was evaluated yet.
+        """
         if not len(self.evaluation_steps):
             raise LedgerError(f"{self.ledger.folder} holds no evaluation yet")
         return float((self.test if split == "test" else self.train)[measure][-1])

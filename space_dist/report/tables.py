@@ -111,7 +111,7 @@ def caveats(configuration: Configuration) -> list[str]:
                      f"{_seeds(unevaluated)}.")  # fmt: skip
     counted = [run for run in configuration.finished if run.evaluated_at_end]
     for split in SPLITS:
-        broken = [run for run in counted if math.isnan(run.final(split, "return"))]
+        broken = [run for run in counted if math.isnan(run.last(split, "return"))]
         lines += [f"{label}: the final {split} return is not a finite number for {_seeds(broken)}, so there is none "
                   "over the seeds."] if broken else []  # fmt: skip
     if len({tuple(run.evaluation_steps.tolist()) for run in configuration.drawn}) > 1:
@@ -178,7 +178,7 @@ def interval_numbers(name: str, found: Interval) -> dict[str, Value]:
 
 def finals(runs: Sequence[Run], split: Split, measure: str) -> FloatArray:
     """`(n,)` final means over the instances, of the runs that were evaluated at their end."""
-    return np.array([run.final(split, measure) for run in runs if run.evaluated_at_end], dtype=np.float64)
+    return np.array([run.last(split, measure) for run in runs if run.evaluated_at_end], dtype=np.float64)
 
 
 def _seeds(runs: Sequence[Run]) -> str:

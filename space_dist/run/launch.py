@@ -169,8 +169,8 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
-                    "resumed with another arithmetic, other code (ours, or that of your own environment, policy or "
-                    "curriculum) or library versions: results are valid, but not "
+                    "resumed with another arithmetic, other code (ours, or that of your own environment, policy, "
+                    "learner or curriculum) or library versions: results are valid, but not "
                     "promised to be the bits of an uninterrupted run; the run is marked (fingerprint_changed)"
                 )
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):

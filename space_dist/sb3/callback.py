@@ -35,8 +35,8 @@ from space_dist.config import (
     PPOConfig,
     Section,
     ValueDisagreementConfig,
+    changes,
     check,
-    flattened,
 )
 from space_dist.curricula import (
     GENERATED,
@@ -529,11 +529,7 @@ class _Session:
                 raise ValueError(f"it is a {type(text).__name__}")
             checkpoint = decode_checkpoint(base64.b64decode(text, validate=True))
             asked, now = checkpoint.data["asked"], self._identity()
-            differences = [
-                f"{key} was {dict(flattened(asked)).get(key)} and is {dict(flattened(now)).get(key)}"
-                for key in sorted({*dict(flattened(asked)), *dict(flattened(now))})
-                if dict(flattened(asked)).get(key) != dict(flattened(now)).get(key)
-            ]
+            differences = [f"{key} was {before} and is {after}" for key, (before, after) in changes(asked, now).items()]
         if differences:
             raise ConfigError(
                 f"CurriculumCallback: the model remembers another curriculum: {'; '.join(differences)} (None: the "

@@ -55,7 +55,9 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
 
 
 def _importable(config: RunConfig) -> str:
-    """How a script imports the class of a run's algorithm, of SB3 or sb3-contrib."""
+    """How a script imports the class of a run's algorithm: the user's own, or of SB3 or sb3-contrib."""
+    if (own := config.learner.import_path) is not None:
+        return own.replace(":", ".")
     algorithm = ALGORITHMS[config.learner.kind]
     return f"{algorithm.__module__.partition('.')[0]}.{algorithm.__name__}"
 

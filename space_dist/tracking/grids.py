@@ -36,7 +36,7 @@ from space_dist.tracking.runs import (
     Snapshot,
     Store,
     TrackingError,
-    flatten,
+    as_params,
     key_of,
     read_snapshot,
 )
@@ -323,7 +323,22 @@ def _look(run: Run, ledger: Ledger, manifest: Manifest, files: tuple[_Signature,
 
 
 def final_return(ledger: Ledger, status: Status) -> float | None:
-    """The last evaluation's mean undiscounted return on the test instances; None if there is no such number.
+    """A run's final mean undiscounted return on the test instances; None if there is no such number.
+
+    Raises LedgerError if the file cannot be read, or not understood.
+    """
+    row = last_evaluation(ledger, status)
+    try:
+        if row is None or not status.is_final(row["steps"]):
+            return None
+        value = row["test"]["return"]
+        return None if value is None else float(value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LedgerError(f"{ledger.folder / METRICS} has rows that this version cannot read: {error!r}") from None
+
+
+def last_evaluation(ledger: Ledger, status: Status) -> Row | None:
+    """The row of a run's last committed evaluation, if there is one.
 
     Reads no more of the file's end than it takes. Raises LedgerError if the file cannot be read, or not understood.
     """
@@ -331,8 +346,7 @@ def final_return(ledger: Ledger, status: Status) -> float | None:
     try:
         for row in _backwards(path, status.committed.get(METRICS, 0)):
             if row["kind"] == "evaluation":
-                value = row["test"]["return"]
-                return None if value is None else float(value)
+                return row
     except OSError as error:
         raise LedgerError(f"{path} cannot be read: {error.strerror}") from None
     except (KeyError, TypeError, ValueError) as error:
@@ -362,7 +376,7 @@ def _backwards(path: Path, size: int) -> Iterator[Row]:
 
 def _settings(cell: Cell) -> dict[str, str]:
     """`setting.<config key>` of everything in which cells differ."""
-    return flatten(cell.settings, "setting.")
+    return as_params(cell.settings, "setting.")
 
 
 def describe(grid: Grid, manifest: Manifest, looks: Sequence[Look]) -> tuple[str, str | None]:
@@ -477,8 +491,8 @@ def _count(number: int, noun: str) -> str:
 
 def _word(value: Any) -> str:
     if isinstance(value, Mapping):
-        return " ".join(f"{key.rpartition('.')[2]}={text}" for key, text in flatten(value).items())
-    return flatten({"value": value})["value"]
+        return " ".join(f"{key.rpartition('.')[2]}={text}" for key, text in as_params(value).items())
+    return as_params({"value": value})["value"]
 
 
 def _cell_text(text: str) -> str:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from space_dist.config import flattened
 from space_dist.config.tracking_uri import UriError, checked_uri
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
@@ -184,16 +185,11 @@ def _metrics(snapshot: Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
             yield index + (position + 1 == len(numbers)), Metric(name, value, milliseconds, steps)
 
 
-def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """`section.key` -> text; lists as JSON."""
-    flat: dict[str, str] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            text = value if isinstance(value, str) else json.dumps(value, default=str)
-            flat[f"{prefix}{key}"[:_MAX_KEY]] = text[:_MAX_PARAM]
-    return flat
+def as_params(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """`section.key` -> text, as long as MLflow takes; lists as JSON."""
+    texts = ((key, value if isinstance(value, str) else json.dumps(value, default=str))
+             for key, value in flattened(config, prefix, empty=True))  # fmt: skip
+    return {key[:_MAX_KEY]: text[:_MAX_PARAM] for key, text in texts}
 
 
 def _tags(snapshot: Snapshot) -> dict[str, str]:
@@ -213,7 +209,7 @@ def _tags(snapshot: Snapshot) -> dict[str, str]:
 
 
 def describe_run(ledger: Ledger, status: Status, config: Mapping[str, Any], rows: Sequence[Row]) -> str:
-    flat = flatten(config)
+    flat = as_params(config)
     what = " · ".join(flat[key] for key in ("curriculum.kind", "learner.kind", "env.id") if key in flat)
     lines = [
         f"**{status.name}**, seed {status.seed}: {what}",
@@ -420,7 +416,7 @@ class Store:
         """Those that are not there yet: a param never changes, and a batch that was cut off is completed."""
         from mlflow.entities import Param
 
-        missing = [Param(key, value) for key, value in flatten(snapshot.config).items() if key not in run.data.params]
+        missing = [Param(key, value) for key, value in as_params(snapshot.config).items() if key not in run.data.params]
         for start in range(0, len(missing), _MAX_PARAMS):
             self._client.log_batch(run.info.run_id, params=missing[start : start + _MAX_PARAMS])
 

@@ -14,7 +14,8 @@ from tests.slurm.gated_env import GATE
 
 sys.path.append(str(ROOT / "jobs"))
 
-from benchmarks.chaos import KINDS, plan, rehearse
+from benchmarks.chaos import rehearse
+from benchmarks.faults import KINDS, plan
 
 BOUNDED = ("kill rollout actor", "stop curriculum actor", "kill driver", "kill Ray head", "kill tracking server")
 

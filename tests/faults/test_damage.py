@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from space_dist import config as configs
-from space_dist import ledger as ledgers
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.ledger import METRICS, ROW_FILES, Checkpoint, Ledger, RunWriter, decode_checkpoint
+from space_dist.ledger import folder as folder_module
+from space_dist.ledger import writer as writer_module
 from space_dist.report import load_run
 from space_dist.run.building import spec_of
 from space_dist.run.launch import launch, policy_of, stored_config
@@ -245,7 +246,8 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_thrown_away(
             raise OSError(5, "Input/output error")
         return read_file(path, limit)
 
-    monkeypatch.setattr(ledgers, "read_file", unreadable)
+    monkeypatch.setattr(folder_module, "read_file", unreadable)
+    monkeypatch.setattr(writer_module, "read_file", unreadable)
     with pytest.raises(SpaceDistError, match=r"cannot be resumed now: .* cannot be read \(Input/output error\)"):
         launch(config, copy, resume=True, stop=StopRequests())
     assert Ledger(copy).checkpoint_files() == checkpoints

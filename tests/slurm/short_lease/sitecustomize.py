@@ -5,6 +5,6 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from space_dist import ledger  # noqa: E402 - libraries read those when they are imported
+from space_dist.ledger import lock  # noqa: E402 - libraries read those when they are imported
 
-ledger.LEASE_SECONDS = 15.0
+lock.LEASE_SECONDS = 15.0

@@ -1,0 +1,120 @@
+"""The schema in sentences: what every key means, and what is wrong with one."""
+
+from __future__ import annotations
+
+import json
+import re
+import types
+from collections.abc import Iterator, Mapping
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel
+
+from space_dist.config.quoting import short
+from space_dist.config.run import RunConfig
+from space_dist.config.tracking_uri import UriError
+from space_dist.errors import nearest
+
+
+def schema() -> Iterator[tuple[str, str, str, str]]:
+    """(key, type, default, explanation) of every field, in order."""
+    yield from _describe(RunConfig, "")
+
+
+def _describe(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str, str, str]]:
+    for name, field in model.model_fields.items():
+        key, inner = f"{prefix}{_key(name, field)}", _models(field)
+        if not inner:
+            default = "required" if field.is_required() else json.dumps(field.get_default(), default=str)
+            yield key, _type_name(field), default, " ".join((field.description or "").split())
+        for section in inner:
+            tag = f" ({section.model_fields['kind'].annotation.__args__[0]})" if len(inner) > 1 else ""  # type: ignore[union-attr]
+            yield f"{key}{tag}", "section", "", " ".join((section.__doc__ or "").split())
+            yield from _describe(section, f"{key}.")
+
+
+def _type_name(field: Any) -> str:
+    annotation = field.annotation
+    name = str(annotation) if get_origin(annotation) else annotation.__name__
+    name = name.replace("typing.", "").replace("NoneType", "null").replace("None", "null")
+    limits = [f"{symbol} {getattr(item, attribute)}" for item in field.metadata
+              for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
+              if hasattr(item, attribute)]  # fmt: skip
+    if name.startswith("tuple"):
+        name = f"list of {re.findall(r'int|float|str', name)[0]}"
+    return " ".join([name, *limits])
+
+
+def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str, str]) -> str:
+    """A fault that pydantic found in a config of the schema `root`: where it lies, what it is, and what is allowed.
+
+    fault: one of `ValidationError.errors()`. source: the file. origins: which keys came from elsewhere.
+    """
+    path, model = _locate(fault["loc"], root)
+    if fault["type"].startswith("union_tag"):
+        path.append("kind")
+    key = ".".join(path)
+    related = (
+        origin for name, origin in origins.items() if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
+    )
+    where = next(related, source)
+    kind, given = fault["type"], fault.get("input")
+    context = fault.get("ctx", {})
+    if kind == "extra_forbidden":
+        allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
+        return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
+    if kind == "missing":
+        return f"{where}: {key}: this key is required"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        tags = [tag.strip("' ") for tag in str(context.get("expected_tags") or _tags(path[0])).split(",")]
+        given_kind = given.get("kind") if isinstance(given, dict) else given
+        hint = nearest(str(given_kind), tags) if given_kind is not None else "."
+        return f"{where}: {key}: {short(given_kind)} is not known{hint} Allowed: {', '.join(tags)}"
+    if kind == "value_error":
+        message = str(context.get("error", fault["msg"]))
+        if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
+            return f"{where}: {key}: {message}" if key else f"{where}: {message}"
+        if isinstance(context.get("error"), UriError):
+            return f"{where}: {key}: {message}"
+        return f"{where}: {key}: {message}, not {short(given)}"
+    return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
+
+
+def _tags(key: str) -> str:
+    return ", ".join(
+        str(get_args(option.model_fields["kind"].annotation)[0]) for option in _models(RunConfig.model_fields[key])
+    )
+
+
+def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[list[str], type[BaseModel] | None]:
+    """Pydantic's location without the tags of unions, and the section it lies in."""
+    path: list[str] = []
+    model: type[BaseModel] | None = root
+    options: list[type[BaseModel]] = []
+    for part in location:
+        tagged = [option for option in options if get_args(option.model_fields["kind"].annotation)[0] == part]
+        if tagged:
+            model, options = tagged[0], []
+            continue
+        if isinstance(part, str) and model is None:
+            continue  # the name pydantic gives to one alternative of a value, like int or literal['log']
+        path.append(str(part))
+        field = model.model_fields.get(str(part)) if model else None
+        inner = _models(field) if field else []
+        if field is not None and part != location[-1]:
+            model = inner[0] if len(inner) == 1 else None
+            options = inner if len(inner) > 1 else []
+    return path, model
+
+
+def _models(field: Any) -> list[type[BaseModel]]:
+    annotations = (
+        get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else [field.annotation]
+    )
+    return [annotation for annotation in annotations
+            if isinstance(annotation, type) and issubclass(annotation, BaseModel)]  # fmt: skip
+
+
+def _key(name: str, field: Any) -> str:
+    """What a config calls a field."""
+    return str(field.alias or name)

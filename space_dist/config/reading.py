@@ -1,0 +1,94 @@
+"""Reading configs: a file, what the command line changes of it, and the check against the schema."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from space_dist.config.explaining import explain
+from space_dist.config.plain_yaml import parse_yaml, read_yaml, to_yaml
+from space_dist.config.run import RunConfig
+from space_dist.errors import ConfigError
+
+_M = TypeVar("_M", bound=BaseModel)
+
+
+def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
+    """Read a config file, apply `a.b=c` overrides and the seed, and check everything.
+
+    Relative instance paths become absolute, from the config's folder (from the current one in an override).
+    Raises ConfigError with the file and key of every fault.
+    """
+    data = read(path)
+    for override in overrides:
+        apply_override(data, override)
+    if seed is not None:
+        data["seed"] = seed
+    origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}
+    return parse(data, str(path), origins)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A run's config as plain data, not checked yet; relative instance paths become absolute, from its folder."""
+    data = read_yaml(path)
+    instances = data.get("instances")
+    if isinstance(instances, dict):
+        data["instances"] = from_folder(instances, path.absolute().parent)
+    return data
+
+
+def from_folder(instances: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The `instances` section with its relative paths taken from `folder`."""
+    return {key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()}
+
+
+def parse(data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> RunConfig:
+    """Check plain data against the schema of a run. `origins` says which keys came from elsewhere than `source`."""
+    return check(RunConfig, data, source, origins)
+
+
+def check(model: type[_M], data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> _M:
+    """Check plain data against any schema made of sections. Raises ConfigError with the key of every fault."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        faults = [explain(fault, model, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
+        raise ConfigError("\n".join(dict.fromkeys(faults))) from None
+
+
+def dump(config: RunConfig) -> str:
+    """The resolved config as YAML, every default written out."""
+    return to_yaml(config.model_dump(mode="json"))
+
+
+def put(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+    """Set `a.b` in nested data, making sections on the way. Raises ConfigError if `a` is no section."""
+    section: Any = data
+    *parents, last = key.split(".")
+    for part in parents:
+        section = section.setdefault(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"{where}: {part!r} is not a section")
+    section[last] = value
+
+
+def apply_override(data: dict[str, Any], override: str) -> None:
+    """Set what `a.b=c` says in plain data; the value is read as YAML. Raises ConfigError if it says nothing."""
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts) or not override.isprintable():
+        raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
+    value = parse_yaml(text, f"--set {override}")
+    if parts[0] == "instances":
+        value = _from_here(value)
+    put(data, ".".join(parts), value, f"--set {override}")
+
+
+def _from_here(value: Any) -> Any:
+    """Instance paths of an override, relative to the current folder, as absolute ones."""
+    if isinstance(value, dict):
+        return {key: _from_here(item) for key, item in value.items()}
+    return str(Path(value).absolute()) if isinstance(value, str) and value else value

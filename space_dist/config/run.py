@@ -1,0 +1,154 @@
+"""The whole config of a run, and what its sections must agree about."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from space_dist.config.curriculum import CurriculumConfig
+from space_dist.config.learner import LearnerConfig, PPOConfig
+from space_dist.config.sections import (
+    NAME,
+    BudgetConfig,
+    CheckpointConfig,
+    EnvConfig,
+    EvaluationConfig,
+    InstancesConfig,
+    ResourcesConfig,
+    RolloutConfig,
+    Section,
+    TrackingConfig,
+)
+
+
+class RunConfig(Section):
+    """One run."""
+
+    name: str = Field(pattern=NAME)
+    """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
+    seed: int = Field(default=0, ge=0, le=2**31 - 1)
+    """The one number from which every random number of the run comes."""
+    engine: Literal["auto", "single", "population"] = "single"
+    """How updates are computed. single: by SB3 itself. population: the same losses for many runs of one shape at once
+    (PPO, as with learner.update: lean, and TRPO, with MlpPolicy); a grid puts such runs together, and one alone has the
+    same bits. auto: population
+    where the learner allows it; decided when a grid is frozen or a run begins. Part of what a run is."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where updates are computed; cuda: a GPU, with engine: population, where up to 1,024 runs share a process. A
+    member's last bits depend on its companions there. Part of what a run is."""
+    arithmetic: Literal["one", "native"] = "one"
+    """Whose bits results have. one: the same on every x86-64 CPU with AVX2 and FMA. native: those of the kernels that
+    libraries choose by the CPU, in processes that have SPACE_DIST_ARITHMETIC=native in their environment. Part of what
+    a run is."""
+    env: EnvConfig
+    instances: InstancesConfig
+    curriculum: CurriculumConfig
+    learner: LearnerConfig
+    rollout: RolloutConfig = RolloutConfig()
+    budget: BudgetConfig
+    evaluation: EvaluationConfig = EvaluationConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    resources: ResourcesConfig = ResourcesConfig()
+
+    @model_validator(mode="after")
+    def _overlap_is_possible(self) -> Self:
+        if not self.rollout.overlap:
+            return self
+        if self.learner.keeps_next_observations:
+            raise ValueError(
+                f"rollout.overlap: true: learner.kind: {self.learner.kind} is off-policy, and learns from older rounds "
+                "anyway; it works with ppo, trpo and a2c"
+            )
+        if self.learner.normalize_observations or self.learner.normalize_rewards:
+            raise ValueError(
+                "rollout.overlap: true cannot be combined with learner.normalize_observations or "
+                "learner.normalize_rewards: a round's scales would not be those of its weights"
+            )
+        if self.engine == "population":
+            raise ValueError("rollout.overlap: true gains nothing with engine: population; use engine: single")
+        return self
+
+    @model_validator(mode="after")
+    def _one_way_to_update(self) -> Self:
+        if self.device == "cuda" and self.engine != "population":
+            raise ValueError(
+                f"device: cuda needs engine: population, not {self.engine}: a single run is faster on a CPU"
+            )
+        if self.engine == "population" and isinstance(self.learner, PPOConfig) and self.learner.update != "stock":
+            raise ValueError(
+                f"learner.update: {self.learner.update} says nothing with engine: population, which has updates of its "
+                "own; use engine: single"
+            )
+        if self.engine == "population" and self.learner.import_path is not None:
+            raise ValueError(
+                "learner.import says nothing with engine: population, which has updates of its own; use engine: single"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _population_shares_a_curriculum(self) -> Self:
+        if self.members == 1:
+            return self
+        if self.engine == "single" or not self.learner.can_be_stacked:
+            raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo or trpo")
+        if self.learner.import_path is not None:
+            raise ValueError(
+                "curriculum.aggregate: population needs engine: population, which has updates of its own, and so none "
+                "for a class that learner.import names"
+            )
+        if self.learner.normalize_observations or self.learner.normalize_rewards:
+            raise ValueError(
+                "curriculum.aggregate: population cannot be combined with learner.normalize_observations or "
+                "learner.normalize_rewards: the policies' values would have scales of their own"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _whole_slots(self) -> Self:
+        per_step = self.rollout.shards * self.rollout.slots
+        if self.n_episodes is not None:
+            if per_step != 1:
+                raise ValueError(
+                    "learner.n_episodes ends rounds by episodes, which takes rollout.shards = 1 and rollout.slots = 1, "
+                    f"not {self.rollout.shards} and {self.rollout.slots}"
+                )
+            return self
+        if self.learner.n_steps % per_step:
+            raise ValueError(
+                f"learner.n_steps = {self.learner.n_steps} is not a multiple of rollout.shards * rollout.slots = "
+                f"{self.rollout.shards} * {self.rollout.slots} = {per_step}"
+            )
+        if self.budget.steps < self.learner.n_steps:
+            raise ValueError(
+                f"budget.steps = {self.budget.steps} is less than one update of learner.n_steps = "
+                f"{self.learner.n_steps}"
+            )
+        return self
+
+    @property
+    def members(self) -> int:
+        """Policies that the run trains."""
+        return self.curriculum.policies_trained
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """What names code of somebody's own, which results depend on: environment, policy, learner and curriculum."""
+        of_env = (self.env.id,) if ":" in self.env.id else ()
+        return (*of_env, *self.learner.import_paths, *self.curriculum.import_paths)
+
+    @property
+    def n_episodes(self) -> int | None:
+        """Episodes per round, where rounds end by episodes."""
+        return self.learner.episodes_per_round
+
+    def slot_length(self, horizon: int) -> int:
+        """Transitions per slot and round; the most there can be, where rounds end by episodes."""
+        if self.n_episodes is not None:
+            return self.n_episodes * horizon
+        return self.learner.n_steps // (self.rollout.shards * self.rollout.slots)
+
+    def round_steps(self, horizon: int) -> int:
+        """Environment steps of a round; the most there can be, where rounds end by episodes."""
+        return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots * self.members

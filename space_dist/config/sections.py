@@ -1,0 +1,161 @@
+"""What sections of a config are made of, and those that are short."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from space_dist.config.tracking_uri import checked_uri
+from space_dist.system.importing import why_refused
+
+MAX_LIST = 10_000  # values of a list in a config
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+
+
+class Section(BaseModel):
+    """A part of a config: nothing unknown, nothing converted, nothing changed later."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True,
+        serialize_by_alias=True,
+    )  # fmt: skip
+
+
+def refuse_library(value: str) -> str:
+    """An id or import path, unless a library's: to read a stranger's config must call no function of a library."""
+    if ":" in value and (reason := why_refused(value)) is not None:
+        raise ValueError(reason)
+    return value
+
+
+def own_path(value: str, like: str) -> str:
+    """An import path of somebody's own. `like`: a name for the sentence that any other word is refused with."""
+    if not all(value.partition(":")):
+        raise ValueError(f"must be an import path with a colon, like my_package.my_module:{like}")
+    return refuse_library(value)
+
+
+class EnvConfig(Section):
+    """The environment."""
+
+    id: str = Field(min_length=1, max_length=300)
+    """Registered id (space_dist/PointMass-v0) or import path (my_package.my_module:make): of a Gymnasium environment
+    with a context_space, of a function that makes one or a batched environment, or of a class of CARL's."""
+    kwargs: dict[str, bool | int | float | str] = {}
+    """Arguments of the environment, by name. What they mean, and their units, is the environment's."""
+    context_visible: bool = True
+    """Whether observations end with the context, scaled from its bounds to [-1, 1]. The released SPaCE code hides it;
+    value-based curricula need it where all episodes start alike."""
+
+    @field_validator("id")
+    @classmethod
+    def _no_library(cls, value: str) -> str:
+        return refuse_library(value)
+
+
+class InstancesConfig(Section):
+    """The instance sets."""
+
+    train: Path = Field(strict=False)
+    """CSV of the training instances (columns: id and the context's features, in environment units); a relative path is
+    relative to this config file."""
+    test: Path = Field(strict=False)
+    """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
+
+
+class RolloutConfig(Section):
+    """How transitions are collected. All of it decides results; how many workers share the shards does not."""
+
+    shards: int = Field(default=4, ge=1, le=4096)
+    """Independent parts of a round; at most this many workers can share it."""
+    slots: int = Field(default=4, ge=1, le=65536)
+    """Environments stepped together in a shard. shards * slots must divide learner.n_steps; episodes go on from round
+    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon."""
+    passes: float = Field(default=1.0, gt=0.0)
+    """Length of an iteration: as many updates as cover this many passes over the selected instances at full horizon."""
+    start_states: int = Field(default=1, ge=1, le=1000)
+    """Seeded start observations per instance whose mean value is its start value. One is exact where episodes start in
+    one state (PointMass)."""
+    overlap: bool = False
+    """Collect a round while the update on the one before it runs, with the weights from before that update: for slow
+    environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO and A2C
+    without normalisation. Source: ours."""
+
+
+class BudgetConfig(Section):
+    """How long a run is."""
+
+    steps: int = Field(ge=1, le=10**12)
+    """Real environment steps of training, warm-up and probes included. A run makes as many whole updates as fit."""
+    episodes: int | None = Field(default=None, ge=1)
+    """Training episodes after which the run ends if its steps have not; null: no such limit."""
+
+
+class EvaluationConfig(Section):
+    """Deterministic evaluation on every training and test instance, on environments and seeds of its own."""
+
+    every_steps: int | Literal["log"] = Field(default=10_000)
+    """Environment steps between evaluations; log: at 1e3, 3e3, 1e4, 3e4, ... Step 0 and the end are evaluated too."""
+    episodes: int = Field(default=1, ge=1, le=1000)
+    """Episodes per instance and evaluation, with the same seeds each time."""
+    legacy_metric: bool = False
+    """Also report `legacy_return`: stochastic policy, sum of r_t * gamma^(T-1-t). Source: the released code's plots."""
+
+    @field_validator("every_steps")
+    @classmethod
+    def _positive(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and value < 1:
+            raise ValueError("must be at least 1, or log")
+        return value
+
+
+class CheckpointConfig(Section):
+    """When the run makes its progress permanent; it does so too when asked to stop. Decides no result."""
+
+    every_rounds: int = Field(default=20, ge=1)
+    """Updates between checkpoints, at most."""
+    every_seconds: float = Field(default=60.0, gt=0.0)
+    """Seconds between checkpoints, at most (and at least one update)."""
+
+
+class TrackingConfig(Section):
+    """Where MLflow keeps its mirror of the run. Decides no result."""
+
+    uri: str | None = Field(default="sqlite:///mlflow.db", max_length=2000)
+    """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; null: none."""
+    experiment: str = Field(default="space_dist", min_length=1, max_length=200)
+    """MLflow experiment."""
+
+    @field_validator("uri")
+    @classmethod
+    def _known_kind(cls, value: str | None) -> str | None:
+        return None if value is None else checked_uri(value)
+
+    live: bool = True
+    """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
+
+
+class Patience(Section):
+    """How long a run waits for room on Ray, and for answers of its actors."""
+
+    room_seconds: float = Field(default=120.0, gt=0.0)
+    """How long to wait for Ray to have room for all workers at once, and, when nodes are lost, for any of them."""
+    late_factor: float = Field(default=20.0, ge=1.0)
+    """An actor that takes this many times the median of such calls is replaced, and its work done elsewhere..."""
+    late_seconds: float = Field(default=60.0, gt=0.0)
+    """... but none before it has taken so many seconds."""
+    first_answer_seconds: float = Field(default=900.0, gt=0.0)
+    """The same limit for an actor's start, and for calls of a kind that has not been answered yet."""
+
+
+class ResourcesConfig(Patience):
+    """What the run may use. Decides no result."""
+
+    workers: int = Field(default=1, ge=0, le=4096)
+    """Ray rollout actors; 0: everything in this process, without Ray."""
+    address: str = Field(default="local", min_length=1, max_length=300)
+    """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
+    grace_seconds: float = Field(default=25.0, gt=0.0)
+    """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
