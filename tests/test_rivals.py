@@ -79,7 +79,7 @@ def feedback(
     )  # fmt: skip
     return Feedback(
         version, np.zeros(n), np.ones(n), 1, episodes=episodes, probes=probes,
-        members=None if members is None else np.array(members, dtype=np.float64),
+        ensemble=None if members is None else np.array(members, dtype=np.float64),
     )  # fmt: skip
 
 

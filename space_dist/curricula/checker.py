@@ -59,7 +59,7 @@ class _FaultError(Exception):
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Iteration:
     """One iteration, made up. flavour: what is uncommon about it, in words that follow a verb; often nothing."""
 
     episodes: Episodes
@@ -106,9 +106,11 @@ class _Check:
         """Where it begins is decided by seed and instances."""
         used = self._make()
         first, again, other = (_called(_START, one.start) for one in (used, used, self._make()))
-        if (place := _difference(again, other)) is not None or (place := _difference(first, other)) is not None:
+        if (difference := _difference(again, other)) is not None or (
+            difference := _difference(first, other)
+        ) is not None:
             raise _FaultError(
-                f"start() is not a function of instances and seed: asked again, it gives another {_place(place)}. "
+                f"start() is not a function of instances and seed: asked again, it gives another {_named(difference)}. "
                 f"{_WHERE_FROM}"
             )
 
@@ -119,16 +121,16 @@ class _Check:
         selections, values = [selection], generator(_SEED, Purpose.EPISODES).normal(size=len(self._instances))
         for decision in range(1, DECISIONS + 1):
             restored = self._check_stored(state, selection)
-            told = self._told(decision, selection, values)
-            feedback = self._feedback(used, state, told, values)
-            answer = self._check_decision(used, (state, restored), feedback, decision, told.flavour)
+            iteration = self._iteration(decision, selection, values)
+            feedback = self._feedback(used, state, iteration, values)
+            answer = self._check_decision(used, (state, restored), feedback, decision, iteration.flavour)
             same = _difference(answer[1].ids, selection.ids) is None
             if answer[1].order_version == selection.order_version and not same:
                 raise _FaultError(
                     "step() selects other instances under the same order_version, and the walk over the old ones would "
                     "go on; set order_version to the version at which ids last changed"
                 )
-            (state, selection, _), values = answer, told.values
+            (state, selection, _), values = answer, iteration.values
             selections.append(selection)
         self._check_stored(state, selection)
         return selections
@@ -142,31 +144,32 @@ class _Check:
         given = copy.deepcopy((state, feedback))
         answer: tuple[State, Selection, Any] = _called(what, lambda: used.step(*given))
         for name, before, after in zip(("state", "feedback"), (state, feedback), given, strict=True):
-            if (place := _difference(before, after, name)) is not None:
+            if (difference := _difference(before, after, name)) is not None:
                 raise _FaultError(
-                    f"step() changes {place}, which it was given, in place; whoever asks again would ask something "
-                    "else. Copy it first"
+                    f"step() changes {difference}, which it was given, in place; whoever asks again would ask "
+                    "something else. Copy it first"
                 )
         begun = [copy.deepcopy((one, feedback)) for one in (state, state, restored)]
         new = [_called(f"{what}, of an object that made no decision before,", functools.partial(self._step_anew, *one),
                        hint=". What it remembers must be in its state") for one in begun]  # fmt: skip
-        if (place := _difference(new[0], new[1])) is not None:
+        if (difference := _difference(new[0], new[1])) is not None:
             raise _FaultError(
-                f"two new objects, given the same state and feedback, give another {_place(place)} each (decision "
+                f"two new objects, given the same state and feedback, give another {_named(difference)} each (decision "
                 f"{decision}): it is not a function of these. {_WHERE_FROM}"
             )
         again = _called(what, lambda: used.step(*copy.deepcopy((state, feedback))))
         for one in (again, answer):
-            if (place := _difference(one, new[0])) is not None:
+            if (difference := _difference(one, new[0])) is not None:
                 raise _FaultError(
-                    f"the object remembers something that is not in its state: it gives another {_place(place)} than a "
-                    f"new one that is given the same state and feedback (decision {decision}). Put all that changes, "
-                    "that of random generators included, into the state; attributes must stay as __init__ made them"
+                    f"the object remembers something that is not in its state: it gives another {_named(difference)} "
+                    f"than a new one that is given the same state and feedback (decision {decision}). Put all that "
+                    "changes, that of random generators included, into the state; attributes must stay as __init__ "
+                    "made them"
                 )
-        if (place := _difference(new[2], new[0])) is not None:
+        if (difference := _difference(new[2], new[0])) is not None:
             raise _FaultError(
                 "the state does not survive storing: as a checkpoint gives it back, it leads to another "
-                f"{_place(place)} (decision {decision})"
+                f"{_named(difference)} (decision {decision})"
             )
         return answer
 
@@ -182,12 +185,12 @@ class _Check:
             f"{kind.__name__}, made of its fields as they are stored,",
             lambda: decode_state(kind, stored.arrays, stored.data["curriculum"]),
         )
-        if (place := _difference(state, restored, kind.__name__)) is not None:
-            raise _FaultError(f"the state does not survive storing: {place} comes back as another")
+        if (difference := _difference(state, restored, kind.__name__)) is not None:
+            raise _FaultError(f"the state does not survive storing: {difference} comes back as another")
         again = _called(_SELECTION, lambda: self._make().selection(restored))
-        if (place := _difference(selection, again, "selection")) is not None:
+        if (difference := _difference(selection, again, "selection")) is not None:
             raise _FaultError(
-                f"selection() of a state gives another {place} than start() or step() returned with it; a run "
+                f"selection() of a state gives another {difference} than start() or step() returned with it; a run "
                 "that goes on would train on something else"
             )
         return restored
@@ -212,10 +215,12 @@ class _Check:
         values = np.zeros(len(self._instances))
         try:
             for decision in range(1, DECISIONS + 1):
-                told = self._told(decision, selection, values)
-                episodes = dataclasses.replace(told.episodes, success=np.full(len(told.episodes.success), np.nan))
-                feedback = self._feedback(used, state, dataclasses.replace(told, episodes=episodes), values)
-                (state, selection, _), values = used.step(state, feedback), told.values
+                iteration = self._iteration(decision, selection, values)
+                episodes = dataclasses.replace(
+                    iteration.episodes, success=np.full(len(iteration.episodes.success), np.nan)
+                )
+                feedback = self._feedback(used, state, dataclasses.replace(iteration, episodes=episodes), values)
+                (state, selection, _), values = used.step(state, feedback), iteration.values
         except Exception as error:  # somebody else's code may raise anything
             text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {error}"
             self._findings.notes.append(
@@ -234,7 +239,7 @@ class _Check:
         except ConfigError as error:
             raise _FaultError(str(error)) from None
 
-    def _told(self, decision: int, selection: Selection, before: FloatArray) -> _Told:
+    def _iteration(self, decision: int, selection: Selection, before: FloatArray) -> _Iteration:
         """One iteration: seeded, and by turns without an episode that ended, and without a gradient step."""
         random = generator(_SEED, Purpose.EPISODES, decision)
         idle, empty = decision % 7 == 3, decision % 5 == 2
@@ -252,13 +257,14 @@ class _Check:
         )  # fmt: skip
         values = before if idle else 0.9 * before + 0.3 * random.normal(size=len(before))
         flavour = " where no episode ended" if empty else " where no gradient step was made" if idle else ""
-        return _Told(episodes, values, 0 if idle else 10, flavour)
+        return _Iteration(episodes, values, 0 if idle else 10, flavour)
 
-    def _feedback(self, used: Custom, state: State, told: _Told, before: FloatArray) -> Feedback:
-        episodes = told.episodes if self._wants.episodes else None
+    def _feedback(self, used: Custom, state: State, iteration: _Iteration, before: FloatArray) -> Feedback:
+        episodes = iteration.episodes if self._wants.episodes else None
         return Feedback(
-            version=state.version, values_before=before, values_after=told.values, gradient_steps=told.gradient_steps,
-            episodes=episodes, probes=self._probed(used, state, episodes) if self._wants.probes else None,
+            version=state.version, values_before=before, values_after=iteration.values,
+            gradient_steps=iteration.gradient_steps, episodes=episodes,
+            probes=self._probed(used, state, episodes) if self._wants.probes else None,
         )  # fmt: skip
 
     def _probed(self, used: Custom, state: State, episodes: Episodes | None) -> Probes | None:
@@ -303,11 +309,11 @@ def _difference(one: Any, other: Any, name: str = "") -> str | None:
         same = (floats or type(one) is type(other)) and equal
         return None if same else name
     found = (_difference(here, there, part) for part, here, there in pairs)
-    return next((place for place in found if place is not None), None)
+    return next((one for one in found if one is not None), None)
 
 
-def _place(place: str) -> str:
-    return place or "answer"
+def _named(part: str) -> str:
+    return part or "answer"
 
 
 def _called(what: str, call: Callable[[], Any], hint: str = "") -> Any:

@@ -24,7 +24,7 @@ from typing import Protocol
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
 from space_dist.experiment.endings import Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.experiment.status import Attempts, Standing, concluded, may_retry, standing_of, standings, unheard
+from space_dist.experiment.status import Attempts, RunStatus, concluded, may_retry, run_status_of, run_statuses, unheard
 from space_dist.ledger import Lock
 from space_dist.system.files import appending, in_words, locked
 from space_dist.system.importing import PYTHON
@@ -95,12 +95,12 @@ class Executor(Protocol):
 
     @property
     def memory_mb(self) -> float:
-        """What a process may use, in MB, if all places are taken; infinite if nobody knows."""
+        """What a process may use, in MB, if as many run as may; infinite if nobody knows."""
 
-    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+    def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """Begin attempts (runs, and which attempt of theirs), in one process that takes the room of one run.
 
-        Raises SpaceDistError if the place itself is gone.
+        Raises SpaceDistError if what it runs on is gone.
         """
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
@@ -144,7 +144,7 @@ class Conductor:
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
         self._overview = Overview(len(runs))
 
-    def conduct(self) -> list[Standing]:
+    def conduct(self) -> list[RunStatus]:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
         self._begin()
         looked = time.monotonic()
@@ -157,16 +157,16 @@ class Conductor:
             if self._elsewhere and time.monotonic() - looked > _ELSEWHERE_SECONDS:
                 looked = time.monotonic()
                 for run in list(self._elsewhere.values()):
-                    self._place(run)
+                    self._enqueue(run)
                     self._end_if_abandoned(run)
             self._show()
             time.sleep(_TICK_SECONDS)
         self._show()
-        return self.standings()
+        return self.run_statuses()
 
-    def standings(self) -> list[Standing]:
+    def run_statuses(self) -> list[RunStatus]:
         """Where all runs stand now, by their files."""
-        return standings(self._grid, self._manifest, code_digest(), self._runs)
+        return run_statuses(self._grid, self._manifest, code_digest(), self._runs)
 
     def _begin(self) -> None:
         adopted = {run.key for run in self._executor.adopt(self._runs)}
@@ -174,26 +174,26 @@ class Conductor:
             if run.key in adopted:
                 self._live[run.key] = run
             else:
-                self._place(run)
+                self._enqueue(run)
 
-    def _place(self, run: Run, delay: float = 0.0) -> None:
+    def _enqueue(self, run: Run, delay: float = 0.0) -> None:
         """Put a run where its files say it belongs."""
         self._elsewhere.pop(run.key, None)
-        standing = standing_of(run, self._grid.ledger(run), self._manifest.retry, code_digest())
-        if standing.condition == "running":
+        run_status = run_status_of(run, self._grid.ledger(run), self._manifest.retry, code_digest())
+        if run_status.condition == "running":
             self._elsewhere[run.key] = run
-        elif standing.condition == "waiting":
-            self._steps[run.key] = standing.steps
-            waiting = self._interrupted if standing.attempts else self._fresh
+        elif run_status.condition == "waiting":
+            self._steps[run.key] = run_status.steps
+            waiting = self._interrupted if run_status.attempts else self._fresh
             waiting.append((time.monotonic() + delay, run))
-        elif standing.condition == "failed":
+        elif run_status.condition == "failed":
             self._overview.failed += 1
-            log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
-        elif not standing.told and standing.supervised:
+            log.warning("%s: %s: %s", run.title, run_status.in_words, run_status.detail)
+        elif not run_status.end_recorded and run_status.supervised:
             self._elsewhere[run.key] = run
         else:
-            if not standing.told:  # its supervisor died in between
-                concluded(standing.ledger, standing.attempts)
+            if not run_status.end_recorded:  # its supervisor died in between
+                concluded(run_status.ledger, run_status.attempts)
             self._overview.done += 1
 
     def _end_if_abandoned(self, run: Run) -> None:
@@ -219,7 +219,7 @@ class Conductor:
             self._live |= {run.key: run for run in chosen}
 
     def _next(self) -> list[Run]:
-        """The runs to be started next, side by side: one, or an equal share of those that can share a process."""
+        """The runs to be started next, in one process: one, or an equal share of those that can share a process."""
         now = time.monotonic()
         ready = [run for not_before, run in (*self._interrupted, *self._fresh) if not_before <= now]
         if not ready or not ready[0].cell.stack:
@@ -262,7 +262,7 @@ class Conductor:
         log.warning("%s: %s%s: %s", run.title, ended.cause.in_words, ", trying again" if again else "", ended.detail)
         self._overview.message = f"{run.title}: {ended.cause.in_words}"
         delay = min(_MAX_DELAY, _FIRST_DELAY * 2 ** max(0, history.ends.get(ended.cause, 0) - 1))
-        self._place(run, 0.0 if self._has_got_on(run) else delay)
+        self._enqueue(run, 0.0 if self._has_got_on(run) else delay)
 
     def _has_got_on(self, run: Run) -> bool:
         """Whether its last attempt has committed anything: then it is not the run that makes its attempts fail."""
@@ -319,16 +319,16 @@ def working_on(
 def _acquired(
     grid: Grid, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
 ) -> Lock:  # fmt: skip
-    lock, told = Lock(grid.lock_file), False
+    lock, said = Lock(grid.lock_file), False
     while True:
         try:
             lock.acquire()
         except RunLockedError as error:
             if not wait:
                 raise
-            if not told:
+            if not said:
                 say(f"{error}. This process takes over then.")
-                told = True
+                said = True
             if reason := stop_requested():
                 raise Interrupted(f"stopped while waiting ({reason})") from None
             time.sleep(_ELSEWHERE_SECONDS)

@@ -54,7 +54,7 @@ _MOST_WORDS = 4000  # of an error
 
 
 @dataclass(frozen=True)
-class Turn:
+class AttemptId:
     """One run's attempt."""
 
     cell: str
@@ -65,7 +65,7 @@ class Turn:
         return f"{self.cell}:{self.seed}:{self.attempt}"
 
     @classmethod
-    def parse(cls, text: str) -> Turn:
+    def parse(cls, text: str) -> AttemptId:
         """The inverse of `str`. Raises ConfigError for anything else."""
         cell, *numbers = text.split(":")
         if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
@@ -75,13 +75,13 @@ class Turn:
 
 @dataclass(frozen=True)
 class Task:
-    """What to attempt, side by side where it is more than one. grid: its folder. address: of the Ray to join.
+    """What to attempt, in one process where it is more than one. grid: its folder. address: of the Ray to join.
 
     where: more about this place (a job's id).
     """
 
     grid: str
-    turns: tuple[Turn, ...]
+    attempts: tuple[AttemptId, ...]
     address: str = "local"
     where: Mapping[str, Any] = field(default_factory=dict)
 
@@ -99,8 +99,8 @@ class Supervisor:
         """
         grid = Grid(task.grid)
         manifest = self._manifest(grid)
-        runs = [manifest.run(turn.cell, turn.seed) for turn in task.turns]
-        begun = {run.key: turn for run, turn in zip(runs, task.turns, strict=True)
+        runs = [manifest.run(attempt_id.cell, attempt_id.seed) for attempt_id in task.attempts]
+        begun = {run.key: attempt_id for run, attempt_id in zip(runs, task.attempts, strict=True)
                  if not grid.ledger(run).owner_alive()}  # fmt: skip
         mine = [run for run in runs if run.key in begun]
         for run in mine:
@@ -255,8 +255,8 @@ class _Watch:
             for attempts in self.attempts:
                 attempts.sign()
         used, state = self._used()
-        limit, members = self.resources.memory_mb, len(self.attempts)
-        if limit is not None and used > members * limit << 20:
+        limit, count = self.resources.memory_mb, len(self.attempts)
+        if limit is not None and used > count * limit << 20:
             self._end(dataclasses.replace(self.seen, over_memory=(used >> 20, limit)))
         self.stopped_since = (self.stopped_since or now) if state == psutil.STATUS_STOPPED else None
         if self.stopped_since is not None and now - self.stopped_since > STOPPED_SECONDS:
@@ -265,7 +265,7 @@ class _Watch:
             minutes, asked_by = self.resources.minutes, stop_requested()
             if asked_by is not None:
                 self._ask(dataclasses.replace(self.seen, asked_by=asked_by))
-            elif minutes is not None and now - self.began > 60.0 * minutes * members:
+            elif minutes is not None and now - self.began > 60.0 * minutes * count:
                 self._ask(dataclasses.replace(self.seen, over_minutes=minutes))
         elif now > self.kill_at:
             self.child.kill()
@@ -390,8 +390,8 @@ class _Manager:
             message = self._next(None)
             if message is not None and "stop" not in message:
                 self._asked_by = None
-                turns = tuple(Turn(**turn) for turn in message.pop("turns"))
-                yield Task(turns=turns, **message)
+                attempts = tuple(AttemptId(**attempt_id) for attempt_id in message.pop("attempts"))
+                yield Task(attempts=attempts, **message)
 
     def stop_requested(self) -> AskedBy | None:
         message = self._next(0.0)
@@ -427,9 +427,9 @@ def main() -> None:
         try:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
-            ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.turns)
-        told = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
-        print(json.dumps({"ends": told}), file=results, flush=True)
+            ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.attempts)
+        ends = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
+        print(json.dumps({"ends": ends}), file=results, flush=True)
 
 
 def preload() -> None:

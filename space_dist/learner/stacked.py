@@ -40,7 +40,7 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True)
-class Place:
+class ParameterSlice:
     """Where a parameter lies within the row of a network."""
 
     first: int
@@ -60,16 +60,16 @@ class Layout:
 
     def __init__(self, shape: Shape) -> None:
         self._length = 0
-        self.log_std = self._place(shape.outputs)
+        self.log_std = self._reserve(shape.outputs)
         sizes = shape.sizes
         self.weights, self.biases = [], []
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
             last = layer == len(sizes) - 2
-            self.weights.append(self._place(n_out, n_in) if last else self._place(n_in, n_out))
-            self.biases.append(self._place(n_out))
+            self.weights.append(self._reserve(n_out, n_in) if last else self._reserve(n_in, n_out))
+            self.biases.append(self._reserve(n_out))
         self.names = dict(self._names(shape))
 
-    def _names(self, shape: Shape) -> Iterator[tuple[str, tuple[int, Place, bool]]]:
+    def _names(self, shape: Shape) -> Iterator[tuple[str, tuple[int, ParameterSlice, bool]]]:
         if not shape.discrete:
             yield "log_std", (ACTOR, self.log_std, False)
         for network, name, head in ((ACTOR, "policy", "action"), (CRITIC, "value", "value")):
@@ -79,8 +79,8 @@ class Layout:
             yield f"{head}_net.weight", (network, self.weights[-1], False)
             yield f"{head}_net.bias", (network, self.biases[-1], False)
 
-    def _place(self, *shape: int) -> Place:
-        place = Place(self._length, shape)
+    def _reserve(self, *shape: int) -> ParameterSlice:
+        place = ParameterSlice(self._length, shape)
         self._length = rounded_up(self._length + math.prod(shape), 16)
         return place
 

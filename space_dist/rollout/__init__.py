@@ -26,7 +26,7 @@ from space_dist.envs.observations import allocate, concatenate, distinct, put, r
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.rollout.policy import Noise, Policy, Several, Valuing, can_act_side_by_side, members_of, side_by_side
+from space_dist.rollout.policy import Noise, Policy, Several, Valuing, batched, can_be_batched, policies_of
 from space_dist.rollout.walk import Unfinished, Walk
 from space_dist.seeding import Purpose, episode_seeds, generator
 
@@ -35,7 +35,7 @@ IntArray = NDArray[np.int64]
 Split = Literal["train", "test"]
 
 CHUNK = 65_536  # start observations scored by one call
-_SHARED, _TOGETHER = -1, -2  # the stages of all shards beyond LIVE, and of all side by side
+_SHARED, _TOGETHER = -1, -2  # the stages of all shards beyond LIVE, and of all in one batch
 BLOCK = 2_048  # rows of one matrix product: what fits the cache. Both are part of every result
 LIVE = 64  # shards whose episodes a worker keeps going between rounds. Decides no result
 
@@ -233,7 +233,7 @@ class Setup:
         return self.shards
 
     def _member(self, policy: Policy | Several, part: int) -> Policy:
-        return members_of(policy)[part // self.walks]
+        return policies_of(policy)[part // self.walks]
 
     def rollout(
         self, policy: Policy | Several, selection: Selection, walk: Walk,
@@ -293,12 +293,12 @@ class Worker:
     def collect_all(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> list[Shard]:
         """All shards of one round; `asked`: see `Setup.rollout`.
 
-        They are collected side by side if the policy can act so: a step of many slots takes hardly longer than one of
+        They are collected in one batch if the policy can act so: a step of many slots takes hardly longer than one of
         few. The bits are the same.
         """
         setup, shards = self._setup, range(self._setup.shards)
         together = 1 < len(shards) <= LIVE and setup.episodes_per_round is None
-        if not together or not can_act_side_by_side(members_of(policy)):
+        if not together or not can_be_batched(policies_of(policy)):
             return [self.collect(policy, selection, walk, shard=shard, **asked) for shard in shards]
         if _TOGETHER not in self._stages:
             self._stages[_TOGETHER] = Stage(self._make(len(shards) * setup.slots))
@@ -311,11 +311,11 @@ class Worker:
     def collect(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> Shard:
         """One shard of one round; `asked`: see `Setup.rollout`."""
         setup, shard = self._setup, asked["shard"]
-        seat = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
-        if seat not in self._stages:
-            self._stages[seat] = Stage(self._first.pop() if self._first else self._make(setup.slots))
+        key = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
+        if key not in self._stages:
+            self._stages[key] = Stage(self._first.pop() if self._first else self._make(setup.slots))
         return collect(
-            self._stages[seat], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
+            self._stages[key], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
         )[0]  # fmt: skip
 
@@ -403,7 +403,7 @@ def collect(
     stage: Stage, rollouts: Sequence[Rollout], *, length: int, episodes: int | None = None,
     keep_next_observations: bool = False,
 ) -> list[Shard]:  # fmt: skip
-    """Collect `length * slots` transitions for each rollout, side by side: an equal share of the slots is each one's.
+    """Collect `length * slots` transitions for each rollout, in one batch: an equal share of the slots is each one's.
 
     A shard has the same bits whoever is collected beside it, and whether its episodes still run on the stage or are
     played again. Slots that end their episode at the same step take the next instances in slot order. What runs at the
@@ -413,7 +413,7 @@ def collect(
     """
     env, slots = stage.env, stage.env.n_slots // len(rollouts)
     walk = Walking(rollouts, slots, length)
-    acting = side_by_side([rollout.policy for rollout in rollouts], slots)
+    acting = batched([rollout.policy for rollout in rollouts], slots)
     noise = Noise.joined([
         Noise.draw(one.policy.head, env.action_space, generator(one.seed, Purpose.ACTIONS, one.round, one.shard),
                    (length, slots))
@@ -561,12 +561,12 @@ class Walking:
 
 
 def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
-    """Measure trials of equally many episodes side by side, all at once, all deterministic or none.
+    """Measure trials of equally many episodes in one batch, all deterministic or none.
 
     The outcomes of one have the same bits whatever is measured beside it.
     """
     count, slots, n_slots = len(trials[0]), np.arange(env.n_slots), env.n_slots
-    acting = side_by_side([trial.policy for trial in trials], count)
+    acting = batched([trial.policy for trial in trials], count)
     noise = None
     if trials[0].random is not None:
         shape = (env.horizon, count)

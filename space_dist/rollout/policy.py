@@ -230,17 +230,17 @@ class Several:
     """Policies that share a curriculum: each acts for itself; a state is worth what they think of it on average."""
 
     version: int
-    members: tuple[Policy, ...]
+    policies: tuple[Policy, ...]
 
     def values(self, observations: Observations) -> NDArray[np.float64]:
-        """`(n, obs_dim) -> (n,)` the mean of the members' values, in unscaled reward units."""
-        values: NDArray[np.float64] = np.mean([member.values(observations) for member in self.members], axis=0)
+        """`(n, obs_dim) -> (n,)` the mean of the policies' values, in unscaled reward units."""
+        values: NDArray[np.float64] = np.mean([policy.values(observations) for policy in self.policies], axis=0)
         return values
 
 
-def members_of(policy: Policy | Several) -> tuple[Policy, ...]:
+def policies_of(policy: Policy | Several) -> tuple[Policy, ...]:
     """The policies that act."""
-    return policy.members if isinstance(policy, Several) else (policy,)
+    return policy.policies if isinstance(policy, Several) else (policy,)
 
 
 @dataclass(frozen=True)
@@ -298,26 +298,26 @@ def blind(policy: Policy, action_space: spaces.Space[Any], version: int) -> Blin
     return BlindPolicy(version, head, 2 * n_actions if head.kind == "squashed" else n_actions)
 
 
-def side_by_side(policies: Sequence[Policy], rows: int) -> Acting:
+def batched(policies: Sequence[Policy], rows: int) -> Acting:
     """One policy that acts for several, of which each has `rows` rows of the observations, in order.
 
-    Each acts as it does alone, bit for bit. Raises TypeError for several that cannot: see `can_act_side_by_side`.
+    Each acts as it does alone, bit for bit. Raises TypeError for several that cannot: see `can_be_batched`.
     """
     if len(policies) == 1:
         return policies[0]
-    return _SideBySide(policies, rows)
+    return _BatchedPolicies(policies, rows)
 
 
-def can_act_side_by_side(policies: Sequence[Policy]) -> bool:
+def can_be_batched(policies: Sequence[Policy]) -> bool:
     """Whether all are multilayer perceptrons of one shape with the same kind of head, Gaussian or categorical."""
     mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
     shapes = {(one.head.kind, one.activation, *(weight.shape for weight, _ in one.actor)) for one in mlps}
     return len(mlps) == len(policies) and len(shapes) == 1 and mlps[0].head.kind in ("gaussian", "categorical")
 
 
-class _SideBySide:
+class _BatchedPolicies:
     def __init__(self, policies: Sequence[Policy], rows: int) -> None:
-        if not can_act_side_by_side(policies):
+        if not can_be_batched(policies):
             raise TypeError("only multilayer perceptrons of one shape, Gaussian or categorical, act side by side")
         mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
         first = mlps[0]

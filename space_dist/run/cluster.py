@@ -1,4 +1,4 @@
-"""Where a run's work is done: the protocol, the curriculum's seat, and the twin of the Ray cluster in this process.
+"""Where a run's work is done: the protocol, the curriculum's host, and the twin of the Ray cluster in this process.
 
 Imports neither Ray nor torch: rollout and curriculum actors are made of this module and `rollout`.
 """
@@ -38,15 +38,15 @@ class Evidence:
 
     after: start values of all instances, chunk by chunk.
     rescored: the values before, chunk by chunk, where scales have changed since and those kept are no longer true.
-    members: start values of all instances by each member of an ensemble, chunk by chunk.
-    episodes: one `Episodes`, whose start values are filled in where the curriculum sits.
+    ensemble: start values of all instances by each member of an ensemble, chunk by chunk.
+    episodes: one `Episodes`, whose start values are filled in where the curriculum is hosted.
     context_values: start values of the episodes' contexts, where those are no instances.
     probes: one `Outcomes` per part.
     """
 
     after: Sequence[Handle]
     rescored: Sequence[Handle] = ()
-    members: Sequence[Handle] = ()
+    ensemble: Sequence[Handle] = ()
     episodes: Sequence[Handle] = ()
     context_values: Sequence[Handle] = ()
     probes: Sequence[Handle] = ()
@@ -94,8 +94,8 @@ class Cluster(Protocol):
         """Wait for values."""
 
 
-class Seat:
-    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state.
+class CurriculumHost:
+    """The curriculum's host: joins what all parts showed and asks the curriculum. Pure; keeps no state.
 
     settings: what the curriculum was made of.
     """
@@ -125,9 +125,9 @@ class Seat:
         after = checked(np.concatenate(seen["after"]), "start values")
         if seen.get("rescored"):
             before = checked(np.concatenate(seen["rescored"]), "start values")
-        members = checked(np.concatenate(seen["members"]), "values of the ensemble") if seen.get("members") else None
+        ensemble = checked(np.concatenate(seen["ensemble"]), "values of the ensemble") if seen.get("ensemble") else None
         feedback = Feedback(
-            version, before, after, gradient_steps, members=members,
+            version, before, after, gradient_steps, ensemble=ensemble,
             episodes=next(self._valued(seen, after), None), probes=self._probed(state, seen),
         )  # fmt: skip
         new, selection, numbers = self.curriculum.step(state, feedback)
@@ -152,8 +152,8 @@ class Seat:
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
 
 
-class Central(Seat):
-    """The seat of a run's curriculum."""
+class Central(CurriculumHost):
+    """The host of a run's curriculum."""
 
     def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
         from space_dist.curricula.making import make_curriculum

@@ -39,7 +39,7 @@ from space_dist.errors import (
     nearest,
 )
 from space_dist.instances import ContextBounds, InstanceSet, read_csv, refuse_overlap
-from space_dist.learner import refuse_machine, torch_probes
+from space_dist.learner import refuse_machine, torch_checks
 from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
@@ -95,15 +95,15 @@ def launch(
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
     SpaceDistError after noting it in the run's status.
     """
-    with begun(config, folder, resume=resume, stop=stop) as course:
-        if not course.outcome.already_done:
-            with _cluster(course) as cluster:
-                course.training(cluster, observe).run()
-    return course.finished()
+    with begun(config, folder, resume=resume, stop=stop) as active:
+        if not active.outcome.already_done:
+            with _cluster(active) as cluster:
+                active.training(cluster, observe).run()
+    return active.finished()
 
 
 @dataclass
-class Course:
+class ActiveRun:
     """A run that is this process's own now. outcome: how it ends; `already_done` where there is nothing to do."""
 
     config: RunConfig
@@ -116,13 +116,13 @@ class Course:
 
     def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
-        self.heed()
+        self.raise_if_stopped()
         return Training(
             self.config, self.setup, cluster, self.writer,
             status=self.status, stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
 
-    def heed(self) -> None:
+    def raise_if_stopped(self) -> None:
         """Raise Interrupted, before the first round, if it was asked to stop."""
         _stop_if_asked(self.writer, self.stop)
 
@@ -137,18 +137,18 @@ class Course:
 
 
 @contextlib.contextmanager
-def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
+def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     """Make the folder this run's, for as long as the context lasts. What is raised within is noted in its status.
 
     Raises as `launch` does.
     """
     # Environments are made and reset from here on.
-    with exits_refused(), _zero_exits_told(), _begun(config, folder, resume=resume, stop=stop) as course:
-        yield course
+    with exits_refused(), _zero_exits_reported(), _begun(config, folder, resume=resume, stop=stop) as active:
+        yield active
 
 
 @contextlib.contextmanager
-def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
+def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
     ledger, spec = Ledger(folder), spec_of(config)
     config = resolved(config, spec)
@@ -160,12 +160,12 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
         status = _claim(config, setup, writer)
-        course = Course(config, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
-        if course.outcome.already_done:
-            yield course
+        active = ActiveRun(config, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
+        if active.outcome.already_done:
+            yield active
             return
         stop.watch(ledger.stop_file, config.resources.grace_seconds)
-        course.pusher = _start_pusher(config, ledger)
+        active.pusher = _start_pusher(config, ledger)
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
@@ -176,8 +176,8 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
                 log.warning("%s", remark)
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
-            course.heed()  # before Ray is started
-            yield course
+            active.raise_if_stopped()  # before Ray is started
+            yield active
 
 
 def _refuse_other_arithmetic(config: RunConfig) -> None:
@@ -258,8 +258,8 @@ def _also_decide(config: RunConfig) -> list[str]:
 @functools.cache
 def arithmetic_digest() -> str:
     """`arithmetic.digest` of all that a run computes with: it is what bits depend on, instead of the CPU's name."""
-    probes = (arithmetic.numpy_probes(), arithmetic.scipy_probes(), torch_probes())
-    return arithmetic.digest(itertools.chain(*probes))
+    checks = (arithmetic.numpy_checks(), arithmetic.scipy_checks(), torch_checks())
+    return arithmetic.digest(itertools.chain(*checks))
 
 
 def _status_before(ledger: Ledger) -> Status | None:
@@ -354,18 +354,18 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
 
 
 @contextlib.contextmanager
-def _cluster(course: Course) -> Iterator[Cluster]:
-    if course.config.resources.workers == 0:
-        with contextlib.closing(InProcess(course.config, course.setup)) as here:
+def _cluster(active: ActiveRun) -> Iterator[Cluster]:
+    if active.config.resources.workers == 0:
+        with contextlib.closing(InProcess(active.config, active.setup)) as here:
             yield here
         return
-    if course.config.resources.address == "local":
+    if active.config.resources.address == "local":
         private_ray()
     from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
-        with course.stop.standing():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed, course.note))
+        with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler
+            cluster = stack.enter_context(RayCluster(active.config, active.setup, active.raise_if_stopped, active.note))
         yield cluster
 
 
@@ -409,7 +409,7 @@ _restore: list[Callable[[int], NoReturn]] = []  # what `os._exit` is otherwise
 
 
 @contextlib.contextmanager
-def _zero_exits_told() -> Iterator[None]:
+def _zero_exits_reported() -> Iterator[None]:
     """Keep `os._exit(0)` from ending a run that is not done with the exit code of one that is.
 
     It cannot be caught, so it is stood in for while a run is unfinished. What ends the process from C is not noticed:
@@ -419,7 +419,7 @@ def _zero_exits_told() -> Iterator[None]:
     if not _at_work:
         end, owner = os._exit, os.getpid()
 
-        def told(code: int) -> NoReturn:
+        def reported(code: int) -> NoReturn:
             if code == 0 and os.getpid() == owner:  # processes that were forked end so
                 code = os.EX_SOFTWARE
                 what = "the environment, or something that it uses, ended the process (os._exit(0))"
@@ -429,7 +429,7 @@ def _zero_exits_told() -> Iterator[None]:
             end(code)
 
         _restore.append(end)
-        os._exit = told  # type: ignore[assignment]
+        os._exit = reported  # type: ignore[assignment]
     mine = object()
     _at_work.append(mine)
     try:

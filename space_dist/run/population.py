@@ -1,8 +1,8 @@
-"""Many runs of one shape in one process, side by side: collected, measured and updated together.
+"""Many runs of one shape in one process, in one batch: collected, measured and updated together.
 
-Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a course (`member`) that says
-what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch of
-environments, and once every member waits for its update, all are made in one tensor program. A member's bits do not
+Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a generator (`member`) that
+says what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch
+of environments, and once every member waits for its update, all are made in one tensor program. A member's bits do not
 depend on its companions, so members may be put together in any way, end when they end, and be resumed among others.
 """
 
@@ -35,11 +35,11 @@ _KEPT = 4  # batches of environments that are kept, beside those in which episod
 
 def member(config: RunConfig, folder: Path, *, stop: StopRequests) -> Work[Outcome]:
     """One run of a population, to its end or from where it stopped; raises as `launch` does."""
-    with begun(config, folder, resume=True, stop=StopRequests(stop)) as course:
-        if not course.outcome.already_done:
-            with contextlib.closing(_Promising(config, course.setup, folder)) as cluster:
-                yield from course.training(cluster).work()
-    return course.finished()
+    with begun(config, folder, resume=True, stop=StopRequests(stop)) as active:
+        if not active.outcome.already_done:
+            with contextlib.closing(_Promising(config, active.setup, folder)) as cluster:
+                yield from active.training(cluster).work()
+    return active.finished()
 
 
 def advance(
@@ -115,13 +115,13 @@ class _Part:
 
 def _parts_of(folder: Path, request: Learn) -> Iterator[_Part]:
     learner = request.learner
-    if not learner.members:
+    if not learner.learners:
         raise TypeError(f"{folder}: a member of a population needs engine: population")
-    for one, shards in zip(learner.members, learner.parts(request.shards), strict=True):
+    for one, shards in zip(learner.learners, learner.parts(request.shards), strict=True):
         yield _Part(folder, request, one, shards)
 
 
-Seat = tuple[str, int]  # a member's folder and a shard
+ShardKey = tuple[str, int]  # a member's folder and a shard
 
 
 @dataclass(eq=False)
@@ -130,7 +130,7 @@ class _Promise:
 
     setup: Setup
     work: Rollout | Trial
-    seat: Seat | None = None  # whose episodes a rollout goes on with
+    shard_key: ShardKey | None = None  # whose episodes a rollout goes on with
     value: Any = None
 
     @property
@@ -162,7 +162,7 @@ class _Promising(InProcess):
         """See `Cluster`."""
         asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
         return [_Promise(self._setup, self._setup.rollout(policy, selection, walk, shard=shard, **asked),
-                         seat=(self._folder, shard))
+                         shard_key=(self._folder, shard))
                 for shard in range(self._setup.shards)]  # fmt: skip
 
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
@@ -177,7 +177,7 @@ class _Workshop:
 
     def __init__(self) -> None:
         self._spare: dict[Hashable, list[BatchedEnv]] = {}  # by batch and slots; the latest used is last
-        self._stages: dict[tuple[Seat, ...], tuple[Hashable, Stage]] = {}  # in which these seats' episodes go on
+        self._stages: dict[tuple[ShardKey, ...], tuple[Hashable, Stage]] = {}  # in which these shards' episodes go on
 
     def answers(self, waiting: Mapping[Path, Wait]) -> dict[Path, Any]:
         """The values that each member waits for; an exception for one whose work failed."""
@@ -191,8 +191,8 @@ class _Workshop:
 
     def close(self) -> None:
         """Free the environments."""
-        for seats in list(self._stages):
-            self._disband(seats)
+        for shard_keys in list(self._stages):
+            self._disband(shard_keys)
         while self._spare:
             self._drop_oldest()
 
@@ -202,7 +202,7 @@ class _Workshop:
             batches[promise.batch].append(promise)
         for batch, promised in batches.items():
             # In the same order every round, whoever was answered first: else episodes would be played again.
-            for some in _parts(sorted(promised, key=lambda promise: promise.seat or ("", 0))):
+            for some in _parts(sorted(promised, key=lambda promise: promise.shard_key or ("", 0))):
                 try:
                     with exits_refused():
                         self._compute(batch, some)
@@ -233,16 +233,16 @@ class _Workshop:
         self.close()
 
     def _stage(self, key: Hashable, promised: Sequence[_Promise]) -> Stage:
-        """Where these seats' episodes go on; their environments from other company are free."""
-        seats = tuple(promise.seat for promise in promised if promise.seat is not None)
-        if seats not in self._stages:
-            for others in [others for others in self._stages if not set(others).isdisjoint(seats)]:
+        """Where these shards' episodes go on; their environments from other company are free."""
+        shard_keys = tuple(promise.shard_key for promise in promised if promise.shard_key is not None)
+        if shard_keys not in self._stages:
+            for others in [others for others in self._stages if not set(others).isdisjoint(shard_keys)]:
                 self._disband(others)
-            self._stages[seats] = (key, Stage(self._env(key, promised)))
-        return self._stages[seats][1]
+            self._stages[shard_keys] = (key, Stage(self._env(key, promised)))
+        return self._stages[shard_keys][1]
 
-    def _disband(self, seats: tuple[Seat, ...]) -> None:
-        key, stage = self._stages.pop(seats)
+    def _disband(self, shard_keys: tuple[ShardKey, ...]) -> None:
+        key, stage = self._stages.pop(shard_keys)
         self._keep_spare(key, stage.env)
 
     def _env(self, key: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:

@@ -37,7 +37,7 @@ from ray.util.placement_group import PlacementGroup, placement_group, placement_
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import digest, numpy_digest, scipy_probes
+from space_dist.arithmetic import digest, numpy_digest, scipy_checks
 from space_dist.arithmetic import settings as arithmetic_settings
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
@@ -94,11 +94,11 @@ def computed(parts: Iterable[str]) -> dict[str, str]:
         if part == "numpy":
             found[part] = numpy_digest()
         elif part == "scipy":
-            found[part] = digest(scipy_probes())
+            found[part] = digest(scipy_checks())
         elif part == "torch":
-            from space_dist.learner import torch_probes  # likewise
+            from space_dist.learner import torch_checks  # likewise
 
-            found[part] = digest(torch_probes())
+            found[part] = digest(torch_checks())
         else:
             found[part] = importlib.metadata.version(part)
     return found
@@ -146,7 +146,7 @@ class CurriculumActor(_Timed, Central):
 
 
 @dataclass(eq=False)
-class _Piece:
+class _RemoteValue:
     """A handle: where a value is, or will be. Recomputing the value moves it.
 
     kept: the driver holds the value too, because nobody could compute it again: what was put, what was decided.
@@ -161,12 +161,12 @@ class _Piece:
 class _Call:
     """A call of an actor's method, kept until its answer has arrived so that it can be made again."""
 
-    piece: int  # of the work, which decides the actor; _CENTRAL for the curriculum actor
+    work: int  # number of the shard, chunk or part, which decides the actor; _CENTRAL for the curriculum actor
     method: str
     arguments: tuple[Any, ...]
     options: dict[str, Any]
-    answers: list[_Piece]
-    seat: int = 0  # the actor's
+    answers: list[_RemoteValue]
+    actor_index: int = 0
     actor: Any = None
     seconds: Any = None  # reference of how long it took: small, so it comes to the driver by itself
     number: int = 0  # in the order of submission, in which actors work
@@ -176,9 +176,9 @@ class _Call:
     since: float | None = None  # when its turn came, on the cluster's clock
 
     @property
-    def pieces(self) -> list[_Piece]:
+    def remote_arguments(self) -> list[_RemoteValue]:
         """The arguments that are handles."""
-        return [argument for argument in self.arguments if isinstance(argument, _Piece)]
+        return [argument for argument in self.arguments if isinstance(argument, _RemoteValue)]
 
 
 class RayCluster:
@@ -190,15 +190,15 @@ class RayCluster:
     """
 
     def __init__(
-        self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+        self, config: RunConfig, setup: Setup, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
     ) -> None:
-        """As `join_ray` for `heed` and `note`."""
+        """As `join_ray` for `raise_if_stopped` and `note`."""
         self._config, self._resources, self._setup = config, config.resources, setup
-        self._heed, self._note = heed, note
+        self._raise_if_stopped, self._note = raise_if_stopped, note
         self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
-        self._actors: dict[int, Any] = {}  # by seat
-        self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
+        self._actors: dict[int, Any] = {}  # by index
+        self._starting: dict[int, tuple[Any, float]] = {}  # index -> its sign of life to be, and since when
         self._failed_starts: dict[int, int] = defaultdict(int)
         self._unanswered: list[_Call] = []
         self._submitted = 0
@@ -209,11 +209,11 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, resources.workers + 1, self._heed, self._note)
+        found = join_ray(resources.address, resources.workers + 1, self._raise_if_stopped, self._note)
         self._session = found["session_dir"] if resources.address == "local" else None
         self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down, note=self._note))
         try:
-            self._setup_piece = self.put(self._setup)
+            self._remote_setup = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
                 raise self._no_room(resources.workers)
             self._start((*range(resources.workers), _CENTRAL))
@@ -239,7 +239,7 @@ class RayCluster:
 
     def put(self, value: object) -> Handle:
         """See `cluster.Cluster`."""
-        return _Piece(ray.put(value), value, kept=True)
+        return _RemoteValue(ray.put(value), value, kept=True)
 
     def collect(
         self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
@@ -276,25 +276,25 @@ class RayCluster:
         self, state: Handle, before: Handle, evidence: Evidence, *, version: int, gradient_steps: int
     ) -> Decision:
         """See `cluster.Cluster`."""
-        layout, pieces = evidence.flat()
-        return Decision(*self._ask(_CENTRAL, "decide", state, before, version, gradient_steps, layout, *pieces))
+        layout, handles = evidence.flat()
+        return Decision(*self._ask(_CENTRAL, "decide", state, before, version, gradient_steps, layout, *handles))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""
-        decided = [piece for call in self._unanswered if call.piece == _CENTRAL for piece in call.answers]
-        wanted = [piece for piece in dict.fromkeys([*handles, *decided]) if not piece.kept]
+        decided = [remote for call in self._unanswered if call.work == _CENTRAL for remote in call.answers]
+        wanted = [remote for remote in dict.fromkeys([*handles, *decided]) if not remote.kept]
         while True:
             self._wait_for_answers()
             try:
-                values = ray.get([piece.ref for piece in wanted], timeout=self._resources.first_answer_seconds)
+                values = ray.get([remote.ref for remote in wanted], timeout=self._resources.first_answer_seconds)
                 break
             except RayTaskError as error:
                 raise _cause(error) from error
             except RayError as error:  # it had been computed, and was lost with a node before it came here
                 self._ask_again(set(), set(self._unanswered), error)
         arrived = dict(zip(wanted, values, strict=True))
-        for piece in decided:  # the next decision needs it, and nobody could make it again
-            piece.value, piece.kept = arrived[piece], True
+        for remote in decided:  # the next decision needs it, and nobody could make it again
+            remote.value, remote.kept = arrived[remote], True
         # What was asked for ahead of its time may still be lost before it is fetched.
         self._unanswered = [call for call in self._unanswered
                             if call.method == "collect" and not arrived.keys() >= set(call.answers)]  # fmt: skip
@@ -302,23 +302,23 @@ class RayCluster:
 
     # ---- calls ----
 
-    def _ask(self, piece: int, method: str, *arguments: Any, **options: Any) -> list[_Piece]:
-        answers = [_Piece(None) for _ in range(_CENTRAL_ANSWERS if piece == _CENTRAL else 1)]
-        call = _Call(piece, method, arguments, options, answers)
+    def _ask(self, work: int, method: str, *arguments: Any, **options: Any) -> list[_RemoteValue]:
+        answers = [_RemoteValue(None) for _ in range(_CENTRAL_ANSWERS if remote == _CENTRAL else 1)]
+        call = _Call(work, method, arguments, options, answers)
         self._unanswered.append(call)
         self._submit(call)
         return answers
 
     def _submit(self, call: _Call) -> None:
-        call.seat = _CENTRAL if call.piece == _CENTRAL else self._seat_for(call.piece)
-        call.actor, call.since, call.answered = self._actors[call.seat], None, False
+        call.actor_index = _CENTRAL if call.work == _CENTRAL else self._actor_for(call.work)
+        call.actor, call.since, call.answered = self._actors[call.actor_index], None, False
         call.number = self._submitted = self._submitted + 1
         several = len(call.answers) > 1
-        arguments = [argument.ref if isinstance(argument, _Piece) else argument for argument in call.arguments]
+        arguments = [argument.ref if isinstance(argument, _RemoteValue) else argument for argument in call.arguments]
         method = call.actor.timed.options(num_returns=1 + len(call.answers))
         call.seconds, *refs = method.remote(call.method, several, *arguments, **call.options)
-        for piece, ref in zip(call.answers, refs, strict=True):
-            piece.ref = ref
+        for remote, ref in zip(call.answers, refs, strict=True):
+            remote.ref = ref
 
     def _wait_for_answers(self) -> None:
         while waiting := [call for call in self._unanswered if not call.answered]:
@@ -341,8 +341,8 @@ class RayCluster:
                         lost.add(call)
                         if isinstance(error, RayTaskError):  # its actor lives; an argument was lost
                             lost |= self._makers(call)
-                        elif self._actors.get(call.seat) is call.actor:
-                            dead.add(call.seat)
+                        elif self._actors.get(call.actor_index) is call.actor:
+                            dead.add(call.actor_index)
             late = self._late()
             if dead or lost or late:
                 self._replace(dead | late)
@@ -350,27 +350,29 @@ class RayCluster:
 
     def _makers(self, call: _Call) -> set[_Call]:
         """The answered calls whose answers were this one's arguments."""
-        return {one for one in self._unanswered if one.answered and not set(one.answers).isdisjoint(call.pieces)}
+        return {
+            one for one in self._unanswered if one.answered and not set(one.answers).isdisjoint(call.remote_arguments)
+        }
 
     def _late(self) -> set[int]:
-        """Seats whose actor has been at its turn for much longer than such calls take."""
+        """Indices of actors that have been at one call for much longer than such calls take."""
         turns: dict[int, _Call] = {}
         for call in sorted((one for one in self._unanswered if not one.answered), key=lambda one: one.number):
-            turns.setdefault(call.seat, call)
-        coming = {piece for call in self._unanswered if not call.answered for piece in call.answers}
+            turns.setdefault(call.actor_index, call)
+        coming = {remote for call in self._unanswered if not call.answered for remote in call.answers}
         late = set()
-        for seat, call in turns.items():
-            if seat in self._starting or any(piece in coming for piece in call.pieces):
+        for index, call in turns.items():
+            if index in self._starting or any(remote in coming for remote in call.remote_arguments):
                 call.since = None  # it waits for somebody else
             elif call.since is None:
                 call.since = self._clock
             elif self._clock - call.since > self._patience(call):
                 log.warning(
                     "%s has not answered for %.0f s where %s takes %.2g s; replacing it",
-                    _name(seat), self._clock - call.since, call.method, self._usual_seconds(call),
+                    _name(index), self._clock - call.since, call.method, self._usual_seconds(call),
                 )  # fmt: skip
                 call.late += 1
-                late.add(seat)
+                late.add(index)
         return late
 
     def _usual_seconds(self, call: _Call) -> float:
@@ -383,16 +385,16 @@ class RayCluster:
             return resources.first_answer_seconds * 2.0**call.late
         return max(resources.late_seconds, resources.late_factor * self._usual_seconds(call)) * 2.0**call.late
 
-    def _ask_again(self, seats: set[int], lost: set[_Call], reason: Exception | None) -> None:
-        """Submit anew what the actors of `seats` owed, what was `lost`, and what was to use either."""
+    def _ask_again(self, indices: set[int], lost: set[_Call], reason: Exception | None) -> None:
+        """Submit anew what the actors `indices` owed, what was `lost`, and what was to use either."""
         if reason is not None:
             log.warning("lost a part of the run (%s); computing it again", type(reason).__name__)
-        moved = {piece for call in lost for piece in call.pieces if piece.kept}
-        for piece in moved:
-            piece.ref = ray.put(piece.value)
+        moved = {remote for call in lost for remote in call.remote_arguments if remote.kept}
+        for remote in moved:
+            remote.ref = ray.put(remote.value)
         for call in self._unanswered:  # in the order of submission, so that arguments are asked for before their users
-            owed = call.seat in seats and not call.answered
-            if call in lost or owed or (not call.answered and not moved.isdisjoint(call.pieces)):
+            owed = call.actor_index in indices and not call.answered
+            if call in lost or owed or (not call.answered and not moved.isdisjoint(call.remote_arguments)):
                 call.attempts += 1
                 if call.attempts == _ATTEMPTS:
                     what = "took too long" if reason is None else f"{type(reason).__name__}: {_first_line(reason)}"
@@ -405,44 +407,44 @@ class RayCluster:
 
     # ---- actors ----
 
-    def _seat_for(self, piece: int) -> int:
-        """The rollout actor for a piece of work: the same one as long as none is lost."""
-        while not (seats := sorted(seat for seat in self._actors if seat not in (_CENTRAL, *self._starting))):
+    def _actor_for(self, work: int) -> int:
+        """The rollout actor for a part of the work: the same one as long as none is lost."""
+        while not (indices := sorted(index for index in self._actors if index not in (_CENTRAL, *self._starting))):
             self._find_other_room()
-        return seats[piece % len(seats)]
+        return indices[work % len(indices)]
 
-    def _start(self, seats: Iterable[int]) -> None:
+    def _start(self, indices: Iterable[int]) -> None:
         """Start actors; they are up once `_look_after_starting` has seen it."""
         if self._room is None:
             raise RuntimeError("actors are started in a room")
-        for seat in seats:
+        for index in indices:
             # Never restarted by Ray: an actor that came back blank would go on silently.
             inside = PlacementGroupSchedulingStrategy(self._room, placement_group_bundle_index=-1)
             options: dict[str, Any] = {"max_restarts": 0, "scheduling_strategy": inside}
             if self._resources.address != "local" and (chosen := arithmetic_settings()):  # our own Ray's inherit them
                 options["runtime_env"] = {"env_vars": chosen}
-            setup = self._setup_piece.ref
-            self._actors[seat] = (
+            setup = self._remote_setup.ref
+            self._actors[index] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup, folders_of_user())
-                if seat == _CENTRAL
+                if index == _CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
-            parts = self._computing[seat == _CENTRAL]
-            self._starting[seat] = (self._actors[seat].ready.remote(parts), time.monotonic())
+            parts = self._computing[index == _CENTRAL]
+            self._starting[index] = (self._actors[index].ready.remote(parts), time.monotonic())
 
     def _close_environments(self) -> None:
         """Have actors close their environments: what these hold outside of their process would outlive it."""
         with contextlib.suppress(RayError):
-            asked = [actor.close.remote() for seat, actor in self._actors.items()
-                     if seat != _CENTRAL and seat not in self._starting]  # fmt: skip
+            asked = [actor.close.remote() for index, actor in self._actors.items()
+                     if index != _CENTRAL and index not in self._starting]  # fmt: skip
             if asked:
                 ray.wait(asked, num_returns=len(asked), timeout=_CLOSING_SECONDS, fetch_local=False)
 
-    def _replace(self, seats: Iterable[int]) -> None:
-        for seat in seats:
+    def _replace(self, indices: Iterable[int]) -> None:
+        for index in indices:
             with contextlib.suppress(RayError):
-                ray.kill(self._actors[seat])  # which also answers whoever waits for what it owed
-        self._start(seats)
+                ray.kill(self._actors[index])  # which also answers whoever waits for what it owed
+        self._start(indices)
 
     def _look_after_starting(self, *, wait: bool = True) -> None:
         """Notice which actors are up by now, and start those again that died before. Raises what stopped them."""
@@ -450,33 +452,33 @@ class RayCluster:
         if not refs:
             return
         arrived = set(ray.wait(refs, timeout=_LOOK_SECONDS if wait else 0, fetch_local=False)[0])
-        for seat, (ref, since) in list(self._starting.items()):
+        for index, (ref, since) in list(self._starting.items()):
             if ref in arrived:
                 try:
                     found = ray.get(ref)
                 except RayError as error:
-                    self._retry_start(seat, error)
+                    self._retry_start(index, error)
                 else:
-                    refuse_other_arithmetic(seat, found)
-                    del self._starting[seat]
-                    self._failed_starts[seat] = 0
+                    refuse_other_arithmetic(index, found)
+                    del self._starting[index]
+                    self._failed_starts[index] = 0
             elif time.monotonic() - since > self._resources.first_answer_seconds:
-                log.warning("%s did not start; trying again", _name(seat))
-                self._retry_start(seat, None)
+                log.warning("%s did not start; trying again", _name(index))
+                self._retry_start(index, None)
 
-    def _retry_start(self, seat: int, error: RayError | None) -> None:
+    def _retry_start(self, index: int, error: RayError | None) -> None:
         cause = None if error is None else error.__cause__
-        self._failed_starts[seat] += 1
+        self._failed_starts[index] += 1
         if isinstance(cause, SpaceDistError):
             raise cause
         if isinstance(cause, RayTaskError) and not _is_loss(cause):  # its environment's or policy's own fault
             raise _cause(cause) from error
-        if self._failed_starts[seat] == _ATTEMPTS:
+        if self._failed_starts[index] == _ATTEMPTS:
             what = "no sign of life" if error is None else _first_line(error)
-            raise SpaceDistError(f"{_name(seat)} died as it started: {what}") from error
+            raise SpaceDistError(f"{_name(index)} died as it started: {what}") from error
         if error is not None:
-            self._setup_piece.ref = ray.put(self._setup)  # it may be what was lost
-        self._replace([seat])
+            self._remote_setup.ref = ray.put(self._setup)  # it may be what was lost
+        self._replace([index])
 
     # ---- room ----
 
@@ -534,12 +536,12 @@ class _Driver(JobConfig):
 
 
 def join_ray(
-    address: str, cpus: int, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+    address: str, cpus: int, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
 ) -> dict[str, Any]:  # fmt: skip
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
-    not enough on a busy machine. While that lasts, `heed` is called, and may raise what ends it. Raises SpaceDistError
+    not enough on a busy machine. While that lasts, `raise_if_stopped` is called, and may raise what ends it. Raises SpaceDistError
     if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that, and
     `note` is told.
     """
@@ -552,11 +554,14 @@ def join_ray(
     late = f"Ray cannot be started or reached {where}: it did not come up in {most:.0f} s"
     while True:
         before, started = set(psutil.Process().children()), Started() if ours else None
-        heed()
+        raise_if_stopped()
         try:
             if not ours:
-                reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, heed)
-            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started, note=note):
+                reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, raise_if_stopped)
+            with (
+                _turn_to_start(raise_if_stopped) if ours else contextlib.nullcontext(),
+                bounded(most, late, started, note=note),
+            ):
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
                     job_config=_Driver(), **options,
@@ -588,11 +593,11 @@ def attended(
     """
     started: Started | None = found["started"]
     where = "of our own" if started else f"at {address!r} (resources.address, or --address)"
-    places = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
+    addresses = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
     if started is not None:
         started.look()
     try:
-        with watched(places, where, started, gone=gone, note=note):
+        with watched(addresses, where, started, gone=gone, note=note):
             yield
     finally:
         late = f"the Ray {where} did not shut down in {SILENT_SECONDS:.0f} s. What was committed is intact"
@@ -603,7 +608,7 @@ def attended(
 
 
 @contextlib.contextmanager
-def _turn_to_start(heed: Callable[[], None]) -> Iterator[None]:
+def _turn_to_start(raise_if_stopped: Callable[[], None]) -> Iterator[None]:
     """Wait for other Rays of ours on this machine to be up: together, nine processes each, all would be too slow.
 
     An abstract socket is held, which is nobody's file, and free again whatever becomes of its holder.
@@ -615,7 +620,7 @@ def _turn_to_start(heed: Callable[[], None]) -> Iterator[None]:
                 turn.bind(f"\0space_dist starts a Ray for {os.getuid()}")
                 break
             except OSError:
-                heed()
+                raise_if_stopped()
                 time.sleep(_LOOK_SECONDS)
         yield
 
@@ -630,20 +635,20 @@ def remove_session(folder: str | None) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def refuse_other_arithmetic(seat: int, found: Mapping[str, str]) -> None:
+def refuse_other_arithmetic(index: int, found: Mapping[str, str]) -> None:
     """Raise SpaceDistError for an actor whose results, `found` by part, would depend on its being there."""
     here = computed(found)
     other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
     if other:
         raise SpaceDistError(
-            f"{_name(seat)} computes other bits than this process with {', '.join(other)}: its node has another kind "
-            "of CPU, or other library versions, and results would depend on who computes what. Keep the run to nodes "
-            "of one kind (resources.address, or the cluster's own constraints)"
+            f"{_name(index)} computes other bits than this process with {', '.join(other)}: its node has another "
+            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
+            "nodes of one kind (resources.address, or the cluster's own constraints)"
         )
 
 
-def _name(seat: int) -> str:
-    return "the curriculum actor" if seat == _CENTRAL else f"rollout actor {seat}"
+def _name(index: int) -> str:
+    return "the curriculum actor" if index == _CENTRAL else f"rollout actor {index}"
 
 
 def _first_line(error: Exception) -> str:

@@ -51,8 +51,8 @@ from space_dist.ledger import (
     encode_values,
 )
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
-from space_dist.rollout.episodes import joined_episodes, mean_sizes, summed, told
-from space_dist.rollout.policy import Statistics, blind, members_of
+from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, summed
+from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import ensemble_of, learner_of, load_learner, model_of, total_steps
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
@@ -60,7 +60,7 @@ from space_dist.run.state import RunState
 
 log = logging.getLogger("space_dist")
 
-PROBE = (1 << 32) - 1  # the round in which first scales are measured
+SCALES_ROUND = (1 << 32) - 1  # the round in which first scales are measured
 
 
 @dataclass
@@ -195,7 +195,7 @@ class Training:
     def _begin(self) -> Work[Handle]:
         cluster = self._cluster
         if self.learner.normalises:
-            yield from self._probe()
+            yield from self._measure_scales()
         policy = cluster.put(self.learner.policy(0))
         first = cluster.begin(cluster.start_values(policy))
         self._adopt(first)
@@ -206,17 +206,18 @@ class Training:
         self._evaluate(policy)
         return policy
 
-    def _probe(self) -> Work[None]:
+    def _measure_scales(self) -> Work[None]:
         """One round of actions that ignore the observation gives the first scales; its steps count like any others.
 
         Its episodes are not gone on with: they say nothing about the policy.
         """
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
-        (seeing,) = members_of(self.learner.policy(0))
-        policy = blind(seeing, self._setup.spec.action_space, PROBE)
+        (seeing,) = policies_of(self.learner.policy(0))
+        policy = blind(seeing, self._setup.spec.action_space, SCALES_ROUND)
         handles = cluster.collect(
-            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=PROBE, steps=0, version=selection.version
+            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=SCALES_ROUND, steps=0,
+            version=selection.version,
         )  # fmt: skip
         shards: list[Shard] = yield Wait(handles)
         self.learner.observe(shards)
@@ -281,20 +282,20 @@ class Training:
     def _evidence(self, policy: Handle, probes: list[Outcomes]) -> Evidence:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
-        rescored, members, episodes, context_values = [], [], [], []
+        rescored, ensemble, episodes, context_values = [], [], [], []
         from_zero = run.version == 0 and self._config.curriculum.starts_from_zero
         if self.learner.normalises and not from_zero:
             # Both values at one scale: else a change of scale would look like progress.
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         if self.ensemble is not None:
-            members = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
+            ensemble = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
         if wants.episodes:
             seen = joined_episodes(run.seen)
             episodes = [cluster.put(seen)]
             if (seen.indices == GENERATED).any():
                 context_values = cluster.context_values(policy, seen.contexts, version=run.version)
         return Evidence(
-            after=cluster.start_values(policy), rescored=rescored, members=members, episodes=episodes,
+            after=cluster.start_values(policy), rescored=rescored, ensemble=ensemble, episodes=episodes,
             context_values=context_values, probes=[cluster.put(part) for part in probes],
         )  # fmt: skip
 
@@ -391,7 +392,7 @@ class Training:
         """Note what a round's episodes and its update showed."""
         run, wants = self._run, self._curriculum.wants
         if wants.episodes:
-            run.seen.append(told(self._setup.train, shards, self._advantages(shards, update)))
+            run.seen.append(curriculum_episodes(self._setup.train, shards, self._advantages(shards, update)))
         run.rollouts.append(summed(shards, lag=run.round - 1 - shards[0].policy_version))
         run.updates.append(update.metrics)
         run.gradient_steps += update.gradient_steps
@@ -407,7 +408,7 @@ class Training:
 
     def _finish(self) -> Work[None]:
         run = self._run
-        if run.rollouts:  # the budget ended inside an iteration: its steps are told, its decision never falls
+        if run.rollouts:  # the budget ended inside an iteration: its steps are logged, its decision is never made
             yield from self._settle()
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
             run.rollouts, run.updates, run.seen = [], [], []

@@ -55,12 +55,12 @@ from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Outcomes, Setup, Worker, endless
-from space_dist.rollout.episodes import joined_episodes, mean_sizes, told
+from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes
 from space_dist.rollout.policy import Valuing
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
-from space_dist.run.cluster import Evidence, Seat
+from space_dist.run.cluster import CurriculumHost, Evidence
 from space_dist.sb3.script import Scored, Wrapped, gradient_steps, network, refuse_model, weights, with_weights
-from space_dist.sb3.vec_env import ContextVecEnv, Course
+from space_dist.sb3.vec_env import ContextVecEnv, RoundPlan
 from space_dist.seeding import Purpose, episode_seeds, global_generators, global_seeds
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class _Session:
         self._shape_rounds()
         self._restored_random: Mapping[str, Any] | None = None  # to go on with, behind the next `begin_round`
         self._open = False  # whether a rollout is being collected
-        self._course: Course | None = None  # of the round that is played
+        self._plan: RoundPlan | None = None  # of the round that is played
         self._sizes_now: list[FloatArray] = []  # |GAE| of this round's rollouts
         self._make()
         self.round = 0
@@ -237,7 +237,7 @@ class _Session:
         self._one_rollout = self._round_steps == rollout
 
     def _make(self) -> None:
-        """The curriculum, its seat, and whoever scores instances, of the environment's seed."""
+        """The curriculum, its host, and whoever scores instances, of the environment's seed."""
         settings, env, model = self._asked.curriculum, self.env, self._model
         if isinstance(settings, GrowingConfig) and settings.aggregate != "own":
             raise ConfigError(
@@ -249,8 +249,8 @@ class _Session:
             env.instances, source=source, seed=env.run_seed, draws=Draws(self._length * env.num_envs, 1),
             bounds=env.bounds,
         )  # fmt: skip
-        self._seat = Seat(makers.make(settings), settings)
-        self._wants = self._seat.curriculum.wants
+        self._host = CurriculumHost(makers.make(settings), settings)
+        self._wants = self._host.curriculum.wants
         spec = _ScriptsSpec(
             "", env.context_visible, {}, env.horizon, env.observation_space, env.action_space, env.bounds,
             maker=env.make_batched,
@@ -279,7 +279,7 @@ class _Session:
                 f"CurriculumCallback: {kind} plays episodes of its own, in which {name} could not act: it asks for "
                 + ("masks" if name == "MaskablePPO" else "what it remembers of the episode")
             )
-        if not knows_success(self.env.make_batched(1), self._seat.curriculum.start()[1].contexts[:1]):
+        if not knows_success(self.env.make_batched(1), self._host.curriculum.start()[1].contexts[:1]):
             raise ConfigError(
                 f"CurriculumCallback: {kind} needs to know whether an episode succeeded, and the environment does not "
                 "say (its steps have no `success`)"
@@ -319,7 +319,7 @@ class _Session:
 
     def begin(self) -> None:
         """Select for the first time."""
-        state, selection, _, values = self._seat.begin(*self._start_values())
+        state, selection, _, values = self._host.begin(*self._start_values())
         self._adopt(state, selection, values)
 
     def _adopt(self, state: State, selection: Selection, values: FloatArray) -> None:
@@ -356,7 +356,7 @@ class _Session:
             context_values=context_values, probes=probes,
         )  # fmt: skip
         layout, pieces = evidence.flat()
-        state, selection, self.numbers, values = self._seat.decide(
+        state, selection, self.numbers, values = self._host.decide(
             self.state, self.values, version, steps - self.gradient_steps, layout, *pieces
         )
         self._adopt(state, selection, values)
@@ -367,7 +367,7 @@ class _Session:
     @property
     def _plays(self) -> bool:
         """Whether the environment is in the midst of this session's round: others may have used it meanwhile."""
-        return self.env.driven and self.env.course is self._course
+        return self.env.driven and self.env.plan is self._plan
 
     def on_rollout_start(self) -> bool:
         """Begin a round where the last one is over; returns whether there was a decision."""
@@ -409,8 +409,8 @@ class _Session:
         if unfinished is not None and len(unfinished.ids) != env.num_envs:  # saved with another number of them
             unfinished, self.sizes = None, None
         start = walk.position(self.selection, 0, 1)
-        self._course = Course(self.selection, start, self._gamma, env.run_seed, self.round, unfinished)
-        current = env.begin_round(self._course, length=self._length, record=self._ensemble is not None)
+        self._plan = RoundPlan(self.selection, start, self._gamma, env.run_seed, self.round, unfinished)
+        current = env.begin_round(self._plan, length=self._length, record=self._ensemble is not None)
         self.wrapped.put(self._model, current)
         self._sizes_now = []
 
@@ -426,7 +426,7 @@ class _Session:
                 sizes = np.concatenate(self._sizes_now)
                 before = np.zeros(sizes.shape[1]) if self.sizes is None else self.sizes
                 means, self.sizes = mean_sizes([shard], sizes, before)
-            self.seen.append(told(self.env.instances, [shard], means))
+            self.seen.append(curriculum_episodes(self.env.instances, [shard], means))
         if self._ensemble is not None:
             self._ensemble.update([shard], self.wrapped.statistics, round=shard.round)
         if self.rounds_left > 0:
@@ -441,7 +441,7 @@ class _Session:
         `model.predict` acts where it explores, on an environment and random numbers of their own.
         """
         env, model = self.env, self._model
-        indices = self._seat.curriculum.probes(self.state, seen) if self._wants.probes else None
+        indices = self._host.curriculum.probes(self.state, seen) if self._wants.probes else None
         if indices is None:
             return []
         most = model.num_timesteps + len(indices) * env.horizon + self._round_steps
@@ -542,7 +542,7 @@ class _Session:
         arrays, run, env, model = checkpoint.arrays, checkpoint.data["run"], self.env, self._model
         env.run_seed = int(run["seed"])
         self._make()
-        curriculum = self._seat.curriculum
+        curriculum = self._host.curriculum
         self.state = decode_state(curriculum.state_type, _under("curriculum/", arrays), checkpoint.data["curriculum"])
         self.selection, self.values = curriculum.selection(self.state), arrays["values"]
         if self.values.shape != (len(env.instances),) or self.selection.version != self.state.version:
