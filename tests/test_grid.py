@@ -401,8 +401,8 @@ class Supervised:
 
 
 def task(grid: Grid, runs: list[Run], attempt: int = 1) -> dict[str, Any]:
-    turns = [{"cell": run.cell.id, "seed": run.seed, "attempt": attempt} for run in runs]
-    return {"grid": str(grid.folder), "turns": turns}
+    attempts = [{"cell": run.cell.id, "seed": run.seed, "attempt": attempt} for run in runs]
+    return {"grid": str(grid.folder), "attempts": attempts}
 
 
 @pytest.fixture(scope="module")
@@ -479,7 +479,7 @@ def test_nobody_is_believed_to_be_done_whose_ledger_is_not(tmp_path: Path, monke
         arguments[-1](run, None)
 
     monkeypatch.setattr(supervisor, "_work", lies)
-    folder, attempt = str(grid.folder), supervisor.Turn(run.cell.id, run.seed, 1)
+    folder, attempt = str(grid.folder), supervisor.AttemptId(run.cell.id, run.seed, 1)
     [ended] = supervisor.Supervisor().attempt(supervisor.Task(folder, (attempt,)), lambda: None)
     assert (ended.cause, "and is not" in ended.detail) == (Cause.CRASH, True)
     assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "failed"
@@ -541,17 +541,17 @@ class Script:
     def room(self) -> int:
         return self.size - len(self.live)
 
-    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
-        self.groups.append([run.key for run, _ in turns])
-        self.live.append(turns)
+    def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
+        self.groups.append([run.key for run, _ in attempts])
+        self.live.append(attempts)
         self.most = max(self.most, len(self.live))
-        for run, attempt in turns:
+        for run, attempt in attempts:
             self.started.append(run.key)
             Attempts(self.grid.ledger(run)).begin(attempt, {})
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         ended: list[tuple[Run, Ended | None]] = []
-        for run, attempt in (turn for turns in self.live for turn in turns):
+        for run, attempt in (attempt_id for attempts in self.live for attempt_id in attempts):
             causes = self.causes.get(run.key, [])
             how = Ended(causes.pop(0) if causes else None, "as told")
             Attempts(self.grid.ledger(run)).end(attempt, how)
@@ -717,7 +717,7 @@ def test_a_run_that_ray_took_with_it_is_lost_and_not_crashed(
             os._exit(1)
 
         monkeypatch.setattr(supervisor, "_work", work)
-        asked = supervisor.Task(str(made.grid.folder), (supervisor.Turn(run.cell.id, run.seed, 1),), address)
+        asked = supervisor.Task(str(made.grid.folder), (supervisor.AttemptId(run.cell.id, run.seed, 1),), address)
         assert [ended.cause for ended in supervisor.Supervisor().attempt(asked, lambda: None)] == [cause]
 
 
@@ -738,8 +738,8 @@ def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
         def room(self) -> int:
             return self.now is None
 
-        def start(self, turns: Sequence[tuple[Run, int]]) -> None:
-            ((run, attempt),) = turns
+        def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
+            ((run, attempt),) = attempts
             self.now = run
             started.append(run)
             Attempts(made.grid.ledger(run)).begin(attempt, {})

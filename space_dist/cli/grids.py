@@ -291,7 +291,7 @@ def grid_retry(
 @grid_app.command("work", hidden=True)
 def grid_work(
     folder: Path,
-    turns: Annotated[list[str], typer.Argument(help="CELL:SEED:ATTEMPT of each run.")],
+    attempts: Annotated[list[str], typer.Argument(help="CELL:SEED:ATTEMPT of each run.")],
     nonce: Annotated[str, typer.Option()],
     job: Annotated[str, typer.Option()],
 ) -> None:
@@ -299,7 +299,7 @@ def grid_work(
     STOP.install()
     from space_dist.experiment.endings import AskedBy, Cause
     from space_dist.grid.pool import refuse_other_folder
-    from space_dist.grid.supervisor import Supervisor, Task, Turn, preload
+    from space_dist.grid.supervisor import AttemptId, Supervisor, Task, preload
     from space_dist.system.workplace import lasting
 
     refuse_other_folder(lasting(folder, "the grid's folder"), nonce)
@@ -311,7 +311,7 @@ def grid_work(
             return None
         return "user" if stop_file.exists() else "others"
 
-    task = Task(str(folder), tuple(map(Turn.parse, turns)), "auto", {"job": job})
+    task = Task(str(folder), tuple(map(AttemptId.parse, attempts)), "auto", {"job": job})
     failed = [ended for ended in Supervisor().attempt(task, stop_requested) if ended.cause is not None]
     for ended in failed:
         warn(f"space-dist: {ended.cause.in_words if ended.cause else ''}: {ended.detail}")

@@ -95,7 +95,7 @@ class Executor(Protocol):
     def memory_mb(self) -> float:
         """What a process may use, in MB, if all places are taken; infinite if nobody knows."""
 
-    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+    def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """Begin attempts (runs, and which attempt of theirs), in one process that takes the room of one run.
 
         Raises SpaceDistError if the place itself is gone.

@@ -34,7 +34,7 @@ from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import Attempts, Standing, settled
 from space_dist.grid.conductor import Conductor, Overview
 from space_dist.grid.pool import Nonce, Pool
-from space_dist.grid.supervisor import Turn, ray_answers
+from space_dist.grid.supervisor import AttemptId, ray_answers
 from space_dist.grid.warm import cores, slurms_memory_of_a_core
 from space_dist.run.ray_session import attended, join_ray, remove_session
 from space_dist.system.importing import PYTHON
@@ -188,26 +188,30 @@ class Jobs:
             metadata = job.metadata or {}
             if metadata.get("folder") != str(self._grid.folder) or job.status not in _LIVE:
                 continue
-            turns = [Turn.parse(text) for text in metadata.get("runs", "").split()]
-            mine = [(known[key], turn.attempt) for turn in turns if (key := f"{turn.cell}/s{turn.seed}") in known]
+            attempts = [AttemptId.parse(text) for text in metadata.get("runs", "").split()]
+            mine = [
+                (known[key], attempt_id.attempt)
+                for attempt_id in attempts
+                if (key := f"{attempt_id.cell}/s{attempt_id.seed}") in known
+            ]
             if mine:
                 self._live[str(job.submission_id)] = mine
-        return [run for turns in self._live.values() for run, _ in turns]
+        return [run for attempts in self._live.values() for run, _ in attempts]
 
     @property
     def size(self) -> int:
         """See `grid.Executor`."""
         return self._max
 
-    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+    def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """See `grid.Executor`. A job of several runs is named after the first, and after how many it has."""
-        (run, attempt), more = turns[0], f"-p{len(turns)}" if len(turns) > 1 else ""
+        (run, attempt), more = attempts[0], f"-p{len(attempts)}" if len(attempts) > 1 else ""
         while True:
             job = f"{_job_name(self._manifest)}-{run.cell.id}-s{run.seed}-a{attempt}{more}"
-            all_turns = [Turn(run.cell.id, run.seed, attempt), *(Turn(one.cell.id, one.seed, number)
-                                                                 for one, number in turns[1:])]  # fmt: skip
+            attempt_ids = [AttemptId(run.cell.id, run.seed, attempt), *(AttemptId(one.cell.id, one.seed, number)
+                                                                 for one, number in attempts[1:])]  # fmt: skip
             command = [
-                *PYTHON, "-m", "space_dist.cli", "grid", "work", str(self._grid.folder), *map(str, all_turns),
+                *PYTHON, "-m", "space_dist.cli", "grid", "work", str(self._grid.folder), *map(str, attempt_ids),
                 "--nonce", self._nonce.text, "--job", job,
             ]  # fmt: skip
             grace = self._manifest.resources.grace_seconds
@@ -218,14 +222,14 @@ class Jobs:
                 metadata={
                     "grid": self._manifest.name, "folder": str(self._grid.folder), "cell": run.cell.id,
                     "label": run.cell.label, "seed": str(run.seed), "attempt": str(attempt),
-                    "runs": " ".join(map(str, all_turns)),
+                    "runs": " ".join(map(str, attempt_ids)),
                     "code": self._manifest.code, **self._manifest.git,
                 },
             )  # fmt: skip
             if not taken and ((details := self._details(job)) is None or details.status not in _LIVE):
                 attempt += 1  # an id can be used once, even if its job never began
                 continue
-            self._live[job] = [(run, attempt), *turns[1:]]
+            self._live[job] = [(run, attempt), *attempts[1:]]
             return
 
     def _details(self, job: str) -> JobDetails | None:
@@ -240,13 +244,13 @@ class Jobs:
             return []
         self._looked = time.monotonic()
         ended: list[tuple[Run, Ended | None]] = []
-        for job, turns in list(self._live.items()):
+        for job, attempts in list(self._live.items()):
             details = self._details(job)
             if details is not None and details.status in _LIVE:
-                self._end_if_silent(job, *turns[0])
+                self._end_if_silent(job, *attempts[0])
                 continue
             del self._live[job]
-            ended += [(run, self._how(run, attempt, details)) for run, attempt in turns]
+            ended += [(run, self._how(run, attempt, details)) for run, attempt in attempts]
         return ended
 
     def _how(self, run: Run, attempt: int, details: JobDetails | None) -> Ended | None:

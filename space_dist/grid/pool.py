@@ -28,7 +28,7 @@ from ray.exceptions import RayActorError, RayError
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.experiment.endings import Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.grid.supervisor import Task, Turn, ray_answers
+from space_dist.grid.supervisor import AttemptId, Task, ray_answers
 from space_dist.grid.warm import SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
 from space_dist.ledger import believed_alive, this_process
 
@@ -75,7 +75,7 @@ class _Slot:
     hired: float
     sign: Any
     node: str | None = None
-    turns: Sequence[tuple[Run, int]] = ()
+    attempts: Sequence[tuple[Run, int]] = ()
     answer: Any = None
     heard: float = 0.0
 
@@ -114,19 +114,19 @@ class Pool:
 
     def room(self) -> int:
         """See `grid.Executor`. A worker that Ray has no CPU for yet is no room."""
-        return sum(not slot.turns and slot.node is not None for slot in self._slots)
+        return sum(not slot.attempts and slot.node is not None for slot in self._slots)
 
     @property
     def size(self) -> int:
         """See `grid.Executor`."""
         return self._size
 
-    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+    def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """See `grid.Executor`."""
-        slot = next(slot for slot in self._slots if not slot.turns and slot.node is not None)
-        each = tuple(Turn(run.cell.id, run.seed, attempt) for run, attempt in turns)
+        slot = next(slot for slot in self._slots if not slot.attempts and slot.node is not None)
+        each = tuple(AttemptId(run.cell.id, run.seed, attempt) for run, attempt in attempts)
         task = Task(str(self._grid.folder), each, self._address)
-        slot.turns, slot.heard = turns, time.monotonic()
+        slot.attempts, slot.heard = attempts, time.monotonic()
         slot.answer = slot.actor.attempt.remote(task)
 
     def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a pool does not outlive its conductor
@@ -136,22 +136,22 @@ class Pool:
     def stop(self) -> None:
         """See `grid.Executor`."""
         for slot in self._slots:
-            if slot.turns:
+            if slot.attempts:
                 slot.actor.stop.remote()
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
         ended: list[tuple[Run, Ended | None]] = []
         for index, slot in enumerate(self._slots):
-            turns = slot.turns
+            attempts = slot.attempts
             try:
-                if turns and ray.wait([slot.answer], timeout=0)[0]:
+                if attempts and ray.wait([slot.answer], timeout=0)[0]:
                     ends = ray.get(slot.answer)
-                    slot.turns, slot.answer = (), None
+                    slot.attempts, slot.answer = (), None
                     if ends is None:
-                        ended += all_lost(self._grid, turns, supervisor_lost(self._stop_requested()))
+                        ended += all_lost(self._grid, attempts, supervisor_lost(self._stop_requested()))
                     else:
-                        ended += understood(turns, ends)
+                        ended += understood(attempts, ends)
                 else:
                     self._listen(slot)
             except RayActorError as error:
@@ -164,7 +164,7 @@ class Pool:
                 log.warning("lost a worker of the pool: %s", str(error).splitlines()[0][:200])
                 lost = self._lost(slot)
                 self._slots[index] = self._hire()
-                ended += all_lost(self._grid, turns, lost)
+                ended += all_lost(self._grid, attempts, lost)
         if all(slot.node is None and time.monotonic() - slot.hired > _START_SECONDS for slot in self._slots):
             raise SpaceDistError(
                 f"Ray did not start a worker of one CPU within {_START_SECONDS:.0f} s; {_cpus()} CPUs are free"

@@ -54,7 +54,7 @@ _MOST_WORDS = 4000  # of an error
 
 
 @dataclass(frozen=True)
-class Turn:
+class AttemptId:
     """One run's attempt."""
 
     cell: str
@@ -65,7 +65,7 @@ class Turn:
         return f"{self.cell}:{self.seed}:{self.attempt}"
 
     @classmethod
-    def parse(cls, text: str) -> Turn:
+    def parse(cls, text: str) -> AttemptId:
         """The inverse of `str`. Raises ConfigError for anything else."""
         cell, *numbers = text.split(":")
         if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
@@ -81,7 +81,7 @@ class Task:
     """
 
     grid: str
-    turns: tuple[Turn, ...]
+    attempts: tuple[AttemptId, ...]
     address: str = "local"
     where: Mapping[str, Any] = field(default_factory=dict)
 
@@ -99,8 +99,8 @@ class Supervisor:
         """
         grid = Grid(task.grid)
         manifest = self._manifest(grid)
-        runs = [manifest.run(turn.cell, turn.seed) for turn in task.turns]
-        begun = {run.key: turn for run, turn in zip(runs, task.turns, strict=True)
+        runs = [manifest.run(attempt_id.cell, attempt_id.seed) for attempt_id in task.attempts]
+        begun = {run.key: attempt_id for run, attempt_id in zip(runs, task.attempts, strict=True)
                  if not grid.ledger(run).owner_alive()}  # fmt: skip
         mine = [run for run in runs if run.key in begun]
         for run in mine:
@@ -390,8 +390,8 @@ class _Manager:
             message = self._next(None)
             if message is not None and "stop" not in message:
                 self._asked_by = None
-                turns = tuple(Turn(**turn) for turn in message.pop("turns"))
-                yield Task(turns=turns, **message)
+                attempts = tuple(AttemptId(**attempt_id) for attempt_id in message.pop("attempts"))
+                yield Task(attempts=attempts, **message)
 
     def stop_requested(self) -> AskedBy | None:
         message = self._next(0.0)
@@ -427,7 +427,7 @@ def main() -> None:
         try:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
-            ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.turns)
+            ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.attempts)
         told = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
         print(json.dumps({"ends": told}), file=results, flush=True)
 

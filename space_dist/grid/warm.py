@@ -21,7 +21,7 @@ from space_dist.errors import SpaceDistError
 from space_dist.experiment.endings import Cause, Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import settled
-from space_dist.grid.supervisor import KILL_SECONDS, STOPPED_SECONDS, Task, Turn
+from space_dist.grid.supervisor import KILL_SECONDS, STOPPED_SECONDS, AttemptId, Task
 from space_dist.system.files import in_words
 from space_dist.system.importing import PYTHON
 
@@ -122,17 +122,17 @@ class WarmSupervisor:
                 self._process.stdin.flush()
 
 
-def understood(turns: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any]]) -> list[tuple[Run, Ended | None]]:
+def understood(attempts: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any]]) -> list[tuple[Run, Ended | None]]:
     """What a supervisor said of its attempts, run by run; None where another process works on the run."""
     return [
         (run, None if end["busy"] else Ended(None if end["cause"] is None else Cause(end["cause"]), end["detail"]))
-        for (run, _), end in zip(turns, ends, strict=True)
+        for (run, _), end in zip(attempts, ends, strict=True)
     ]
 
 
-def all_lost(grid: Grid, turns: Sequence[tuple[Run, int]], seen: Evidence) -> list[tuple[Run, Ended | None]]:
+def all_lost(grid: Grid, attempts: Sequence[tuple[Run, int]], seen: Evidence) -> list[tuple[Run, Ended | None]]:
     """Those that are done are done; nobody but whoever manages them can say how the others ended."""
-    return [(run, settled(grid.ledger(run), attempt, seen)) for run, attempt in turns]
+    return [(run, settled(grid.ledger(run), attempt, seen)) for run, attempt in attempts]
 
 
 def supervisor_lost(reason: str | None) -> Evidence:
@@ -152,7 +152,7 @@ class OnePlace:
         self._grid, self._stop_requested = grid, stop_requested
         self._supervisor = WarmSupervisor(grid.folder)
         self._seconds = manifest.resources.grace_seconds + KILL_SECONDS
-        self._turns: Sequence[tuple[Run, int]] = ()
+        self._attempts: Sequence[tuple[Run, int]] = ()
         self._not_before = self._looked = 0.0
         self.memory_mb = memory_of_a_core()
 
@@ -166,18 +166,18 @@ class OnePlace:
 
     def room(self) -> int:
         """See `grid.Executor`."""
-        return int(not self._turns and time.monotonic() >= self._not_before)
+        return int(not self._attempts and time.monotonic() >= self._not_before)
 
-    def start(self, turns: Sequence[tuple[Run, int]]) -> None:
+    def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """See `grid.Executor`."""
-        each = tuple(Turn(run.cell.id, run.seed, attempt) for run, attempt in turns)
+        each = tuple(AttemptId(run.cell.id, run.seed, attempt) for run, attempt in attempts)
         try:
             self._supervisor.begin(Task(str(self._grid.folder), each))
         except OSError as error:
             raise SpaceDistError(
                 f"cannot start a process for the runs of {self._grid.folder}: {in_words(error)}"
             ) from None
-        self._turns = turns
+        self._attempts = attempts
 
     def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a supervisor does not outlive its conductor
         """See `grid.Executor`."""
@@ -185,23 +185,23 @@ class OnePlace:
 
     def stop(self) -> None:
         """See `grid.Executor`."""
-        if self._turns:
+        if self._attempts:
             self._supervisor.stop()
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
-        if not self._turns:
+        if not self._attempts:
             return []
         try:
             if (ends := self._supervisor.ended(0.0)) is None:
                 self._look()
                 return []
-            found = understood(self._turns, ends)
+            found = understood(self._attempts, ends)
         except SupervisorLostError:
             log.warning("lost the supervisor")
-            found = all_lost(self._grid, self._turns, supervisor_lost(self._stop_requested()))
+            found = all_lost(self._grid, self._attempts, supervisor_lost(self._stop_requested()))
             self._not_before = time.monotonic() + _PAUSE_SECONDS
-        self._turns = ()
+        self._attempts = ()
         return found
 
     def _look(self) -> None:
