@@ -56,11 +56,11 @@ class Worker:
     def collect(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> Shard:
         """One shard of one round; `asked`: see `Setup.rollout`."""
         setup, shard = self._setup, asked["shard"]
-        seat = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
-        if seat not in self._stages:
-            self._stages[seat] = Stage(self._first.pop() if self._first else self._make(setup.slots))
+        key = shard if shard in self._stages or len(self._stages) < LIVE else _SHARED
+        if key not in self._stages:
+            self._stages[key] = Stage(self._first.pop() if self._first else self._make(setup.slots))
         return collect(
-            self._stages[seat], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
+            self._stages[key], [setup.rollout(policy, selection, walk, **asked)], length=setup.slot_length,
             episodes=setup.episodes_per_round, keep_next_observations=setup.keep_next_observations,
         )[0]  # fmt: skip
 

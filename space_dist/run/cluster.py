@@ -1,4 +1,4 @@
-"""Where a run's work is done: the protocol, the curriculum's seat, and the twin of the Ray cluster in this process.
+"""Where a run's work is done: the protocol, the curriculum's host, and the twin of the Ray cluster in this process.
 
 Imports neither Ray nor torch: rollout and curriculum actors are made of this module and `rollout`.
 """
@@ -39,7 +39,7 @@ class Evidence:
     after: start values of all instances, chunk by chunk.
     rescored: the values before, chunk by chunk, where scales have changed since and those kept are no longer true.
     members: start values of all instances by each member of an ensemble, chunk by chunk.
-    episodes: one `Episodes`, whose start values are filled in where the curriculum sits.
+    episodes: one `Episodes`, whose start values are filled in where the curriculum is hosted.
     context_values: start values of the episodes' contexts, where those are no instances.
     probes: one `Outcomes` per part.
     """
@@ -94,8 +94,8 @@ class Cluster(Protocol):
         """Wait for values."""
 
 
-class Seat:
-    """The curriculum's seat: joins what all parts showed and asks the curriculum. Pure; keeps no state.
+class CurriculumHost:
+    """The curriculum's host: joins what all parts showed and asks the curriculum. Pure; keeps no state.
 
     settings: what the curriculum was made of.
     """
@@ -152,8 +152,8 @@ class Seat:
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
 
 
-class Central(Seat):
-    """The seat of a run's curriculum."""
+class Central(CurriculumHost):
+    """The host of a run's curriculum."""
 
     def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
         from space_dist.curricula.making import make_curriculum

@@ -121,7 +121,7 @@ def _parts_of(folder: Path, request: Learn) -> Iterator[_Part]:
         yield _Part(folder, request, one, shards)
 
 
-Seat = tuple[str, int]  # a member's folder and a shard
+ShardKey = tuple[str, int]  # a member's folder and a shard
 
 
 @dataclass(eq=False)
@@ -130,7 +130,7 @@ class _Promise:
 
     setup: Setup
     work: Rollout | Trial
-    seat: Seat | None = None  # whose episodes a rollout goes on with
+    shard_key: ShardKey | None = None  # whose episodes a rollout goes on with
     value: Any = None
 
     @property
@@ -162,7 +162,7 @@ class _Promising(InProcess):
         """See `Cluster`."""
         asked = {"round": round, "steps": steps, "selection_version": version, "lag": lag}
         return [_Promise(self._setup, self._setup.rollout(policy, selection, walk, shard=shard, **asked),
-                         seat=(self._folder, shard))
+                         shard_key=(self._folder, shard))
                 for shard in range(self._setup.shards)]  # fmt: skip
 
     def evaluate(self, policy: Handle, split: Split, *, stochastic: bool = False) -> list[Handle]:
@@ -177,7 +177,7 @@ class _Workshop:
 
     def __init__(self) -> None:
         self._spare: dict[Hashable, list[BatchedEnv]] = {}  # by batch and slots; the latest used is last
-        self._stages: dict[tuple[Seat, ...], tuple[Hashable, Stage]] = {}  # in which these seats' episodes go on
+        self._stages: dict[tuple[ShardKey, ...], tuple[Hashable, Stage]] = {}  # in which these shards' episodes go on
 
     def answers(self, waiting: Mapping[Path, Wait]) -> dict[Path, Any]:
         """The values that each member waits for; an exception for one whose work failed."""
@@ -191,8 +191,8 @@ class _Workshop:
 
     def close(self) -> None:
         """Free the environments."""
-        for seats in list(self._stages):
-            self._disband(seats)
+        for shard_keys in list(self._stages):
+            self._disband(shard_keys)
         while self._spare:
             self._drop_oldest()
 
@@ -202,7 +202,7 @@ class _Workshop:
             batches[promise.batch].append(promise)
         for batch, promised in batches.items():
             # In the same order every round, whoever was answered first: else episodes would be played again.
-            for some in _parts(sorted(promised, key=lambda promise: promise.seat or ("", 0))):
+            for some in _parts(sorted(promised, key=lambda promise: promise.shard_key or ("", 0))):
                 try:
                     with exits_refused():
                         self._compute(batch, some)
@@ -233,16 +233,16 @@ class _Workshop:
         self.close()
 
     def _stage(self, key: Hashable, promised: Sequence[_Promise]) -> Stage:
-        """Where these seats' episodes go on; their environments from other company are free."""
-        seats = tuple(promise.seat for promise in promised if promise.seat is not None)
-        if seats not in self._stages:
-            for others in [others for others in self._stages if not set(others).isdisjoint(seats)]:
+        """Where these shards' episodes go on; their environments from other company are free."""
+        shard_keys = tuple(promise.shard_key for promise in promised if promise.shard_key is not None)
+        if shard_keys not in self._stages:
+            for others in [others for others in self._stages if not set(others).isdisjoint(shard_keys)]:
                 self._disband(others)
-            self._stages[seats] = (key, Stage(self._env(key, promised)))
-        return self._stages[seats][1]
+            self._stages[shard_keys] = (key, Stage(self._env(key, promised)))
+        return self._stages[shard_keys][1]
 
-    def _disband(self, seats: tuple[Seat, ...]) -> None:
-        key, stage = self._stages.pop(seats)
+    def _disband(self, shard_keys: tuple[ShardKey, ...]) -> None:
+        key, stage = self._stages.pop(shard_keys)
         self._keep_spare(key, stage.env)
 
     def _env(self, key: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:

@@ -64,9 +64,9 @@ class CurriculumActor(_Timed, Central):
         super().__init__(config, setup.train, setup.spec.context_bounds)
 
 
-def name_of(seat: int) -> str:
+def name_of(index: int) -> str:
     """What messages call an actor."""
-    return "the curriculum actor" if seat == CENTRAL else f"rollout actor {seat}"
+    return "the curriculum actor" if index == CENTRAL else f"rollout actor {index}"
 
 
 def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[str, ...]:
@@ -100,13 +100,13 @@ def computed(parts: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def refuse_other_arithmetic(seat: int, found: Mapping[str, str]) -> None:
+def refuse_other_arithmetic(index: int, found: Mapping[str, str]) -> None:
     """Raise SpaceDistError for an actor whose results, `found` by part, would depend on its being there."""
     here = computed(found)
     other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
     if other:
         raise SpaceDistError(
-            f"{name_of(seat)} computes other bits than this process with {', '.join(other)}: its node has another kind "
+            f"{name_of(index)} computes other bits than this process with {', '.join(other)}: its node has another kind "
             "of CPU, or other library versions, and results would depend on who computes what. Keep the run to nodes "
             "of one kind (resources.address, or the cluster's own constraints)"
         )

@@ -79,7 +79,7 @@ class _Call:
     arguments: tuple[Any, ...]
     options: dict[str, Any]
     answers: list[_Piece]
-    seat: int = 0  # the actor's
+    actor_index: int = 0
     actor: Any = None
     seconds: Any = None  # reference of how long it took: small, so it comes to the driver by itself
     number: int = 0  # in the order of submission, in which actors work
@@ -110,8 +110,8 @@ class RayCluster:
         self._heed, self._note = heed, note
         self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
-        self._actors: dict[int, Any] = {}  # by seat
-        self._starting: dict[int, tuple[Any, float]] = {}  # seat -> its sign of life to be, and since when
+        self._actors: dict[int, Any] = {}  # by index
+        self._starting: dict[int, tuple[Any, float]] = {}  # index -> its sign of life to be, and since when
         self._failed_starts: dict[int, int] = defaultdict(int)
         self._unanswered: list[_Call] = []
         self._submitted = 0
@@ -223,8 +223,8 @@ class RayCluster:
         return answers
 
     def _submit(self, call: _Call) -> None:
-        call.seat = CENTRAL if call.piece == CENTRAL else self._seat_for(call.piece)
-        call.actor, call.since, call.answered = self._actors[call.seat], None, False
+        call.actor_index = CENTRAL if call.piece == CENTRAL else self._actor_for(call.piece)
+        call.actor, call.since, call.answered = self._actors[call.actor_index], None, False
         call.number = self._submitted = self._submitted + 1
         several = len(call.answers) > 1
         arguments = [argument.ref if isinstance(argument, _Piece) else argument for argument in call.arguments]
@@ -254,8 +254,8 @@ class RayCluster:
                         lost.add(call)
                         if isinstance(error, RayTaskError):  # its actor lives; an argument was lost
                             lost |= self._makers(call)
-                        elif self._actors.get(call.seat) is call.actor:
-                            dead.add(call.seat)
+                        elif self._actors.get(call.actor_index) is call.actor:
+                            dead.add(call.actor_index)
             late = self._late()
             if dead or lost or late:
                 self._replace(dead | late)
@@ -266,24 +266,24 @@ class RayCluster:
         return {one for one in self._unanswered if one.answered and not set(one.answers).isdisjoint(call.pieces)}
 
     def _late(self) -> set[int]:
-        """Seats whose actor has been at its turn for much longer than such calls take."""
+        """Indices of actors that have been at one call for much longer than such calls take."""
         turns: dict[int, _Call] = {}
         for call in sorted((one for one in self._unanswered if not one.answered), key=lambda one: one.number):
-            turns.setdefault(call.seat, call)
+            turns.setdefault(call.actor_index, call)
         coming = {piece for call in self._unanswered if not call.answered for piece in call.answers}
         late = set()
-        for seat, call in turns.items():
-            if seat in self._starting or any(piece in coming for piece in call.pieces):
+        for index, call in turns.items():
+            if index in self._starting or any(piece in coming for piece in call.pieces):
                 call.since = None  # it waits for somebody else
             elif call.since is None:
                 call.since = self._clock
             elif self._clock - call.since > self._patience(call):
                 log.warning(
                     "%s has not answered for %.0f s where %s takes %.2g s; replacing it",
-                    name_of(seat), self._clock - call.since, call.method, self._usual_seconds(call),
+                    name_of(index), self._clock - call.since, call.method, self._usual_seconds(call),
                 )  # fmt: skip
                 call.late += 1
-                late.add(seat)
+                late.add(index)
         return late
 
     def _usual_seconds(self, call: _Call) -> float:
@@ -296,15 +296,15 @@ class RayCluster:
             return resources.first_answer_seconds * 2.0**call.late
         return max(resources.late_seconds, resources.late_factor * self._usual_seconds(call)) * 2.0**call.late
 
-    def _ask_again(self, seats: set[int], lost: set[_Call], reason: Exception | None) -> None:
-        """Submit anew what the actors of `seats` owed, what was `lost`, and what was to use either."""
+    def _ask_again(self, indices: set[int], lost: set[_Call], reason: Exception | None) -> None:
+        """Submit anew what the actors `indices` owed, what was `lost`, and what was to use either."""
         if reason is not None:
             log.warning("lost a part of the run (%s); computing it again", type(reason).__name__)
         moved = {piece for call in lost for piece in call.pieces if piece.kept}
         for piece in moved:
             piece.ref = ray.put(piece.value)
         for call in self._unanswered:  # in the order of submission, so that arguments are asked for before their users
-            owed = call.seat in seats and not call.answered
+            owed = call.actor_index in indices and not call.answered
             if call in lost or owed or (not call.answered and not moved.isdisjoint(call.pieces)):
                 call.attempts += 1
                 if call.attempts == _ATTEMPTS:
@@ -318,44 +318,44 @@ class RayCluster:
 
     # ---- actors ----
 
-    def _seat_for(self, piece: int) -> int:
+    def _actor_for(self, piece: int) -> int:
         """The rollout actor for a piece of work: the same one as long as none is lost."""
-        while not (seats := sorted(seat for seat in self._actors if seat not in (CENTRAL, *self._starting))):
+        while not (indices := sorted(index for index in self._actors if index not in (CENTRAL, *self._starting))):
             self._find_other_room()
-        return seats[piece % len(seats)]
+        return indices[piece % len(indices)]
 
-    def _start(self, seats: Iterable[int]) -> None:
+    def _start(self, indices: Iterable[int]) -> None:
         """Start actors; they are up once `_look_after_starting` has seen it."""
         if self._room is None:
             raise RuntimeError("actors are started in a room")
-        for seat in seats:
+        for index in indices:
             # Never restarted by Ray: an actor that came back blank would go on silently.
             inside = PlacementGroupSchedulingStrategy(self._room, placement_group_bundle_index=-1)
             options: dict[str, Any] = {"max_restarts": 0, "scheduling_strategy": inside}
             if self._resources.address != "local" and (chosen := arithmetic_settings()):  # our own Ray's inherit them
                 options["runtime_env"] = {"env_vars": chosen}
             setup = self._setup_piece.ref
-            self._actors[seat] = (
+            self._actors[index] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup, folders_of_user())
-                if seat == CENTRAL
+                if index == CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
-            parts = self._computing[seat == CENTRAL]
-            self._starting[seat] = (self._actors[seat].ready.remote(parts), time.monotonic())
+            parts = self._computing[index == CENTRAL]
+            self._starting[index] = (self._actors[index].ready.remote(parts), time.monotonic())
 
     def _close_environments(self) -> None:
         """Have actors close their environments: what these hold outside of their process would outlive it."""
         with contextlib.suppress(RayError):
-            asked = [actor.close.remote() for seat, actor in self._actors.items()
-                     if seat != CENTRAL and seat not in self._starting]  # fmt: skip
+            asked = [actor.close.remote() for index, actor in self._actors.items()
+                     if index != CENTRAL and index not in self._starting]  # fmt: skip
             if asked:
                 ray.wait(asked, num_returns=len(asked), timeout=_CLOSING_SECONDS, fetch_local=False)
 
-    def _replace(self, seats: Iterable[int]) -> None:
-        for seat in seats:
+    def _replace(self, indices: Iterable[int]) -> None:
+        for index in indices:
             with contextlib.suppress(RayError):
-                ray.kill(self._actors[seat])  # which also answers whoever waits for what it owed
-        self._start(seats)
+                ray.kill(self._actors[index])  # which also answers whoever waits for what it owed
+        self._start(indices)
 
     def _look_after_starting(self, *, wait: bool = True) -> None:
         """Notice which actors are up by now, and start those again that died before. Raises what stopped them."""
@@ -363,33 +363,33 @@ class RayCluster:
         if not refs:
             return
         arrived = set(ray.wait(refs, timeout=_LOOK_SECONDS if wait else 0, fetch_local=False)[0])
-        for seat, (ref, since) in list(self._starting.items()):
+        for index, (ref, since) in list(self._starting.items()):
             if ref in arrived:
                 try:
                     found = ray.get(ref)
                 except RayError as error:
-                    self._retry_start(seat, error)
+                    self._retry_start(index, error)
                 else:
-                    refuse_other_arithmetic(seat, found)
-                    del self._starting[seat]
-                    self._failed_starts[seat] = 0
+                    refuse_other_arithmetic(index, found)
+                    del self._starting[index]
+                    self._failed_starts[index] = 0
             elif time.monotonic() - since > self._resources.first_answer_seconds:
-                log.warning("%s did not start; trying again", name_of(seat))
-                self._retry_start(seat, None)
+                log.warning("%s did not start; trying again", name_of(index))
+                self._retry_start(index, None)
 
-    def _retry_start(self, seat: int, error: RayError | None) -> None:
+    def _retry_start(self, index: int, error: RayError | None) -> None:
         cause = None if error is None else error.__cause__
-        self._failed_starts[seat] += 1
+        self._failed_starts[index] += 1
         if isinstance(cause, SpaceDistError):
             raise cause
         if isinstance(cause, RayTaskError) and not _is_loss(cause):  # its environment's or policy's own fault
             raise _cause(cause) from error
-        if self._failed_starts[seat] == _ATTEMPTS:
+        if self._failed_starts[index] == _ATTEMPTS:
             what = "no sign of life" if error is None else first_line(error)
-            raise SpaceDistError(f"{name_of(seat)} died as it started: {what}") from error
+            raise SpaceDistError(f"{name_of(index)} died as it started: {what}") from error
         if error is not None:
             self._setup_piece.ref = ray.put(self._setup)  # it may be what was lost
-        self._replace([seat])
+        self._replace([index])
 
     # ---- room ----
 

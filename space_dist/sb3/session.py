@@ -56,7 +56,7 @@ from space_dist.rollout import Outcomes, Setup, Worker, endless
 from space_dist.rollout.episodes import joined_episodes, mean_sizes, told
 from space_dist.rollout.policy import Valuing
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
-from space_dist.run.cluster import Evidence, Seat
+from space_dist.run.cluster import CurriculumHost, Evidence
 from space_dist.sb3.script import Scored, Wrapped, gradient_steps, network, refuse_model, weights, with_weights
 from space_dist.sb3.vec_env import ContextVecEnv, Course
 from space_dist.seeding import Purpose, episode_seeds, global_generators, global_seeds
@@ -139,7 +139,7 @@ class Session:
         self._one_rollout = self._round_steps == rollout
 
     def _make(self) -> None:
-        """The curriculum, its seat, and whoever scores instances, of the environment's seed."""
+        """The curriculum, its host, and whoever scores instances, of the environment's seed."""
         settings, env, model = self._asked.curriculum, self.env, self._model
         if isinstance(settings, GrowingConfig) and settings.aggregate != "own":
             raise ConfigError(
@@ -151,8 +151,8 @@ class Session:
             env.instances, source=source, seed=env.run_seed, draws=Draws(self._length * env.num_envs, 1),
             bounds=env.bounds,
         )  # fmt: skip
-        self._seat = Seat(makers.make(settings), settings)
-        self._wants = self._seat.curriculum.wants
+        self._host = CurriculumHost(makers.make(settings), settings)
+        self._wants = self._host.curriculum.wants
         spec = _ScriptsSpec(
             "", env.context_visible, {}, env.horizon, env.observation_space, env.action_space, env.bounds,
             maker=env.make_batched,
@@ -181,7 +181,7 @@ class Session:
                 f"CurriculumCallback: {kind} plays episodes of its own, in which {name} could not act: it asks for "
                 + ("masks" if name == "MaskablePPO" else "what it remembers of the episode")
             )
-        if not knows_success(self.env.make_batched(1), self._seat.curriculum.start()[1].contexts[:1]):
+        if not knows_success(self.env.make_batched(1), self._host.curriculum.start()[1].contexts[:1]):
             raise ConfigError(
                 f"CurriculumCallback: {kind} needs to know whether an episode succeeded, and the environment does not "
                 "say (its steps have no `success`)"
@@ -221,7 +221,7 @@ class Session:
 
     def begin(self) -> None:
         """Select for the first time."""
-        state, selection, _, values = self._seat.begin(*self._start_values())
+        state, selection, _, values = self._host.begin(*self._start_values())
         self._adopt(state, selection, values)
 
     def _adopt(self, state: State, selection: Selection, values: FloatArray) -> None:
@@ -258,7 +258,7 @@ class Session:
             context_values=context_values, probes=probes,
         )  # fmt: skip
         layout, pieces = evidence.flat()
-        state, selection, self.numbers, values = self._seat.decide(
+        state, selection, self.numbers, values = self._host.decide(
             self.state, self.values, version, steps - self.gradient_steps, layout, *pieces
         )
         self._adopt(state, selection, values)
@@ -343,7 +343,7 @@ class Session:
         `model.predict` acts where it explores, on an environment and random numbers of their own.
         """
         env, model = self.env, self._model
-        indices = self._seat.curriculum.probes(self.state, seen) if self._wants.probes else None
+        indices = self._host.curriculum.probes(self.state, seen) if self._wants.probes else None
         if indices is None:
             return []
         most = model.num_timesteps + len(indices) * env.horizon + self._round_steps
@@ -448,7 +448,7 @@ class Session:
         arrays, run, env, model = checkpoint.arrays, checkpoint.data["run"], self.env, self._model
         env.run_seed = int(run["seed"])
         self._make()
-        curriculum = self._seat.curriculum
+        curriculum = self._host.curriculum
         self.state = decode_state(curriculum.state_type, _under("curriculum/", arrays), checkpoint.data["curriculum"])
         self.selection, self.values = curriculum.selection(self.state), arrays["values"]
         if self.values.shape != (len(env.instances),) or self.selection.version != self.state.version:

@@ -161,13 +161,13 @@ def test_a_lost_node_is_survived_with_what_is_left(
     def lose(actors: Any) -> None:
         import ray
 
-        seats = [
-            seat for seat, actor in actors._actors.items()
+        indices = [
+            index for index, actor in actors._actors.items()
             if ray.get(actor.__ray_call__.remote(
                 lambda self: __import__("ray").get_runtime_context().get_node_id()
             )) == node.node_id
         ]  # fmt: skip
-        on_lost_node.extend(seats)
+        on_lost_node.extend(indices)
         cluster.remove_node(node, allow_graceful=False)
 
     monkeypatch.setattr(cluster_class, "collect", hurting(cluster_class, "collect", {3}, lose))
