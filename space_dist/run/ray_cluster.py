@@ -59,7 +59,7 @@ log = logging.getLogger("space_dist")
 
 
 @dataclass(eq=False)
-class _Piece:
+class _RemoteValue:
     """A handle: where a value is, or will be. Recomputing the value moves it.
 
     kept: the driver holds the value too, because nobody could compute it again: what was put, what was decided.
@@ -74,11 +74,11 @@ class _Piece:
 class _Call:
     """A call of an actor's method, kept until its answer has arrived so that it can be made again."""
 
-    piece: int  # of the work, which decides the actor; CENTRAL for the curriculum actor
+    work: int  # number of the shard, chunk or part, which decides the actor; CENTRAL for the curriculum actor
     method: str
     arguments: tuple[Any, ...]
     options: dict[str, Any]
-    answers: list[_Piece]
+    answers: list[_RemoteValue]
     actor_index: int = 0
     actor: Any = None
     seconds: Any = None  # reference of how long it took: small, so it comes to the driver by itself
@@ -89,9 +89,9 @@ class _Call:
     since: float | None = None  # when its turn came, on the cluster's clock
 
     @property
-    def pieces(self) -> list[_Piece]:
+    def remote_arguments(self) -> list[_RemoteValue]:
         """The arguments that are handles."""
-        return [argument for argument in self.arguments if isinstance(argument, _Piece)]
+        return [argument for argument in self.arguments if isinstance(argument, _RemoteValue)]
 
 
 class RayCluster:
@@ -126,7 +126,7 @@ class RayCluster:
         self._session = found["session_dir"] if resources.address == "local" else None
         self._watch.enter_context(attended(found, resources.address, gone=True, leave=shut_down, note=self._note))
         try:
-            self._setup_piece = self.put(self._setup)
+            self._remote_setup = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
                 raise self._no_room(resources.workers)
             self._start((*range(resources.workers), CENTRAL))
@@ -152,7 +152,7 @@ class RayCluster:
 
     def put(self, value: object) -> Handle:
         """See `cluster.Cluster`."""
-        return _Piece(ray.put(value), value, kept=True)
+        return _RemoteValue(ray.put(value), value, kept=True)
 
     def collect(
         self, policy: Handle, selection: Handle, walk: Walk, *, round: int, steps: int, version: int, lag: int = 0
@@ -189,25 +189,25 @@ class RayCluster:
         self, state: Handle, before: Handle, evidence: Evidence, *, version: int, gradient_steps: int
     ) -> Decision:
         """See `cluster.Cluster`."""
-        layout, pieces = evidence.flat()
-        return Decision(*self._ask(CENTRAL, "decide", state, before, version, gradient_steps, layout, *pieces))
+        layout, handles = evidence.flat()
+        return Decision(*self._ask(CENTRAL, "decide", state, before, version, gradient_steps, layout, *handles))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""
-        decided = [piece for call in self._unanswered if call.piece == CENTRAL for piece in call.answers]
-        wanted = [piece for piece in dict.fromkeys([*handles, *decided]) if not piece.kept]
+        decided = [remote for call in self._unanswered if call.work == CENTRAL for remote in call.answers]
+        wanted = [remote for remote in dict.fromkeys([*handles, *decided]) if not remote.kept]
         while True:
             self._wait_for_answers()
             try:
-                values = ray.get([piece.ref for piece in wanted], timeout=self._resources.first_answer_seconds)
+                values = ray.get([remote.ref for remote in wanted], timeout=self._resources.first_answer_seconds)
                 break
             except RayTaskError as error:
                 raise _cause(error) from error
             except RayError as error:  # it had been computed, and was lost with a node before it came here
                 self._ask_again(set(), set(self._unanswered), error)
         arrived = dict(zip(wanted, values, strict=True))
-        for piece in decided:  # the next decision needs it, and nobody could make it again
-            piece.value, piece.kept = arrived[piece], True
+        for remote in decided:  # the next decision needs it, and nobody could make it again
+            remote.value, remote.kept = arrived[remote], True
         # What was asked for ahead of its time may still be lost before it is fetched.
         self._unanswered = [call for call in self._unanswered
                             if call.method == "collect" and not arrived.keys() >= set(call.answers)]  # fmt: skip
@@ -215,23 +215,23 @@ class RayCluster:
 
     # ---- calls ----
 
-    def _ask(self, piece: int, method: str, *arguments: Any, **options: Any) -> list[_Piece]:
-        answers = [_Piece(None) for _ in range(_CENTRAL_ANSWERS if piece == CENTRAL else 1)]
-        call = _Call(piece, method, arguments, options, answers)
+    def _ask(self, work: int, method: str, *arguments: Any, **options: Any) -> list[_RemoteValue]:
+        answers = [_RemoteValue(None) for _ in range(_CENTRAL_ANSWERS if work == CENTRAL else 1)]
+        call = _Call(work, method, arguments, options, answers)
         self._unanswered.append(call)
         self._submit(call)
         return answers
 
     def _submit(self, call: _Call) -> None:
-        call.actor_index = CENTRAL if call.piece == CENTRAL else self._actor_for(call.piece)
+        call.actor_index = CENTRAL if call.work == CENTRAL else self._actor_for(call.work)
         call.actor, call.since, call.answered = self._actors[call.actor_index], None, False
         call.number = self._submitted = self._submitted + 1
         several = len(call.answers) > 1
-        arguments = [argument.ref if isinstance(argument, _Piece) else argument for argument in call.arguments]
+        arguments = [argument.ref if isinstance(argument, _RemoteValue) else argument for argument in call.arguments]
         method = call.actor.timed.options(num_returns=1 + len(call.answers))
         call.seconds, *refs = method.remote(call.method, several, *arguments, **call.options)
-        for piece, ref in zip(call.answers, refs, strict=True):
-            piece.ref = ref
+        for remote, ref in zip(call.answers, refs, strict=True):
+            remote.ref = ref
 
     def _wait_for_answers(self) -> None:
         while waiting := [call for call in self._unanswered if not call.answered]:
@@ -263,17 +263,19 @@ class RayCluster:
 
     def _makers(self, call: _Call) -> set[_Call]:
         """The answered calls whose answers were this one's arguments."""
-        return {one for one in self._unanswered if one.answered and not set(one.answers).isdisjoint(call.pieces)}
+        return {
+            one for one in self._unanswered if one.answered and not set(one.answers).isdisjoint(call.remote_arguments)
+        }
 
     def _late(self) -> set[int]:
         """Indices of actors that have been at one call for much longer than such calls take."""
         turns: dict[int, _Call] = {}
         for call in sorted((one for one in self._unanswered if not one.answered), key=lambda one: one.number):
             turns.setdefault(call.actor_index, call)
-        coming = {piece for call in self._unanswered if not call.answered for piece in call.answers}
+        coming = {remote for call in self._unanswered if not call.answered for remote in call.answers}
         late = set()
         for index, call in turns.items():
-            if index in self._starting or any(piece in coming for piece in call.pieces):
+            if index in self._starting or any(remote in coming for remote in call.remote_arguments):
                 call.since = None  # it waits for somebody else
             elif call.since is None:
                 call.since = self._clock
@@ -300,12 +302,12 @@ class RayCluster:
         """Submit anew what the actors `indices` owed, what was `lost`, and what was to use either."""
         if reason is not None:
             log.warning("lost a part of the run (%s); computing it again", type(reason).__name__)
-        moved = {piece for call in lost for piece in call.pieces if piece.kept}
-        for piece in moved:
-            piece.ref = ray.put(piece.value)
+        moved = {remote for call in lost for remote in call.remote_arguments if remote.kept}
+        for remote in moved:
+            remote.ref = ray.put(remote.value)
         for call in self._unanswered:  # in the order of submission, so that arguments are asked for before their users
             owed = call.actor_index in indices and not call.answered
-            if call in lost or owed or (not call.answered and not moved.isdisjoint(call.pieces)):
+            if call in lost or owed or (not call.answered and not moved.isdisjoint(call.remote_arguments)):
                 call.attempts += 1
                 if call.attempts == _ATTEMPTS:
                     what = "took too long" if reason is None else f"{type(reason).__name__}: {first_line(reason)}"
@@ -318,11 +320,11 @@ class RayCluster:
 
     # ---- actors ----
 
-    def _actor_for(self, piece: int) -> int:
-        """The rollout actor for a piece of work: the same one as long as none is lost."""
+    def _actor_for(self, work: int) -> int:
+        """The rollout actor for a part of the work: the same one as long as none is lost."""
         while not (indices := sorted(index for index in self._actors if index not in (CENTRAL, *self._starting))):
             self._find_other_room()
-        return indices[piece % len(indices)]
+        return indices[work % len(indices)]
 
     def _start(self, indices: Iterable[int]) -> None:
         """Start actors; they are up once `_look_after_starting` has seen it."""
@@ -334,7 +336,7 @@ class RayCluster:
             options: dict[str, Any] = {"max_restarts": 0, "scheduling_strategy": inside}
             if self._resources.address != "local" and (chosen := arithmetic_settings()):  # our own Ray's inherit them
                 options["runtime_env"] = {"env_vars": chosen}
-            setup = self._setup_piece.ref
+            setup = self._remote_setup.ref
             self._actors[index] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup, folders_of_user())
                 if index == CENTRAL
@@ -388,7 +390,7 @@ class RayCluster:
             what = "no sign of life" if error is None else first_line(error)
             raise SpaceDistError(f"{name_of(index)} died as it started: {what}") from error
         if error is not None:
-            self._setup_piece.ref = ray.put(self._setup)  # it may be what was lost
+            self._remote_setup.ref = ray.put(self._setup)  # it may be what was lost
         self._replace([index])
 
     # ---- room ----
