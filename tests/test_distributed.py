@@ -135,11 +135,11 @@ def test_rays_of_our_own_start_one_at_a_time(tmp_path: Path, monkeypatch: pytest
         stop = StopRequests()
         stop.watch(tmp_path / "stop", 1.0)
 
-        def heed() -> None:
+        def raise_if_stopped() -> None:
             if reason := stop.reason():
                 raise Interrupted(reason)
 
-        with pytest.raises(Interrupted), ray_session._turn_to_start(heed):  # who waits hears a stop
+        with pytest.raises(Interrupted), ray_session._turn_to_start(raise_if_stopped):  # who waits hears a stop
             pass
         monkeypatch.setattr(ray_session, "_TURN_SECONDS", 0.3)
         with ray_session._turn_to_start(lambda: None):  # one that never ends holds nobody up

@@ -88,12 +88,12 @@ def _joined(
 ) -> Iterator[str]:  # fmt: skip
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
 
-    def heed() -> None:
+    def raise_if_stopped() -> None:
         if reason := stop_requested():
             raise Interrupted(f"stopped before Ray was started ({reason})")
 
     # A run with rollout actors may have more processes than this machine has cores; they share them.
-    context = join_ray(address, max(cores(), (max_parallel or 1) * manifest.cpus_per_run), heed)
+    context = join_ray(address, max(cores(), (max_parallel or 1) * manifest.cpus_per_run), raise_if_stopped)
 
     def leave() -> None:
         if ray_answers(context["gcs_address"]):

@@ -114,13 +114,13 @@ class Course:
 
     def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
-        self.heed()
+        self.raise_if_stopped()
         return Training(
             self.config, self.setup, cluster, self.writer,
             status=self.status, stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
 
-    def heed(self) -> None:
+    def raise_if_stopped(self) -> None:
         """Raise Interrupted, before the first round, if it was asked to stop."""
         _stop_if_asked(self.writer, self.stop)
 
@@ -175,7 +175,7 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
                 log.warning("%s", remark)
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
-            course.heed()  # before Ray is started
+            course.raise_if_stopped()  # before Ray is started
             yield course
 
 
@@ -364,7 +364,7 @@ def _cluster(course: Course) -> Iterator[Cluster]:
 
     with contextlib.ExitStack() as stack:
         with course.stop.standing():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.heed, course.note))
+            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.raise_if_stopped, course.note))
         yield cluster
 
 

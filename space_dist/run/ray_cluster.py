@@ -103,11 +103,11 @@ class RayCluster:
     """
 
     def __init__(
-        self, config: RunConfig, setup: Setup, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+        self, config: RunConfig, setup: Setup, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
     ) -> None:
-        """As `join_ray` for `heed` and `note`."""
+        """As `join_ray` for `raise_if_stopped` and `note`."""
         self._config, self._resources, self._setup = config, config.resources, setup
-        self._heed, self._note = heed, note
+        self._raise_if_stopped, self._note = raise_if_stopped, note
         self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by index
@@ -122,7 +122,7 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, resources.workers + 1, self._heed, self._note)
+        found = join_ray(resources.address, resources.workers + 1, self._raise_if_stopped, self._note)
         self._session = found["session_dir"] if resources.address == "local" else None
         self._watch.enter_context(attended(found, resources.address, gone=True, leave=shut_down, note=self._note))
         try:

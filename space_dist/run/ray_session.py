@@ -51,12 +51,12 @@ class _Driver(JobConfig):
 
 
 def join_ray(
-    address: str, cpus: int, heed: Callable[[], None] = lambda: None, note: Note = nowhere
+    address: str, cpus: int, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
 ) -> dict[str, Any]:  # fmt: skip
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
-    not enough on a busy machine. While that lasts, `heed` is called, and may raise what ends it. Raises SpaceDistError
+    not enough on a busy machine. While that lasts, `raise_if_stopped` is called, and may raise what ends it. Raises SpaceDistError
     if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that, and
     `note` is told.
     """
@@ -69,11 +69,14 @@ def join_ray(
     late = f"Ray cannot be started or reached {where}: it did not come up in {most:.0f} s"
     while True:
         before, started = set(psutil.Process().children()), Started() if ours else None
-        heed()
+        raise_if_stopped()
         try:
             if not ours:
-                reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, heed)
-            with _turn_to_start(heed) if ours else contextlib.nullcontext(), bounded(most, late, started, note=note):
+                reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, raise_if_stopped)
+            with (
+                _turn_to_start(raise_if_stopped) if ours else contextlib.nullcontext(),
+                bounded(most, late, started, note=note),
+            ):
                 context = ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
                     job_config=_Driver(), **options,
@@ -120,7 +123,7 @@ def attended(
 
 
 @contextlib.contextmanager
-def _turn_to_start(heed: Callable[[], None]) -> Iterator[None]:
+def _turn_to_start(raise_if_stopped: Callable[[], None]) -> Iterator[None]:
     """Wait for other Rays of ours on this machine to be up: together, nine processes each, all would be too slow.
 
     An abstract socket is held, which is nobody's file, and free again whatever becomes of its holder.
@@ -132,7 +135,7 @@ def _turn_to_start(heed: Callable[[], None]) -> Iterator[None]:
                 turn.bind(f"\0space_dist starts a Ray for {os.getuid()}")
                 break
             except OSError:
-                heed()
+                raise_if_stopped()
                 time.sleep(_LOOK_SECONDS)
         yield
 

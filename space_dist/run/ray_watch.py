@@ -63,7 +63,7 @@ def asked(address: str, seconds: float = _ASK_SECONDS) -> Literal["answers", "si
     return "answers"
 
 
-def reach(address: str, heed: Callable[[], None]) -> None:
+def reach(address: str, raise_if_stopped: Callable[[], None]) -> None:
     """Wait until HOST:PORT answers, for 30 s at most; other addresses are Ray's to find. Raises SpaceDistError."""
     place = address.rpartition("://")[2]
     host, _, port = place.rpartition(":")
@@ -71,7 +71,7 @@ def reach(address: str, heed: Callable[[], None]) -> None:
         return
     until = time.monotonic() + REACH_SECONDS
     while (found := asked(place, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
-        heed()
+        raise_if_stopped()
         if time.monotonic() > until:
             what = "nobody listens there" if found == "gone" else "what listens there does not answer"
             raise SpaceDistError(f"{what}, for {REACH_SECONDS:.0f} s")
