@@ -93,15 +93,15 @@ def launch(
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
     SpaceDistError after noting it in the run's status.
     """
-    with begun(config, folder, resume=resume, stop=stop) as course:
-        if not course.outcome.already_done:
-            with _cluster(course) as cluster:
-                course.training(cluster, observe).run()
-    return course.finished()
+    with begun(config, folder, resume=resume, stop=stop) as active:
+        if not active.outcome.already_done:
+            with _cluster(active) as cluster:
+                active.training(cluster, observe).run()
+    return active.finished()
 
 
 @dataclass
-class Course:
+class ActiveRun:
     """A run that is this process's own now. outcome: how it ends; `already_done` where there is nothing to do."""
 
     config: RunConfig
@@ -136,18 +136,18 @@ class Course:
 
 
 @contextlib.contextmanager
-def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
+def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     """Make the folder this run's, for as long as the context lasts. What is raised within is noted in its status.
 
     Raises as `launch` does.
     """
     # Environments are made and reset from here on.
-    with exits_refused(), _zero_exits_told(), _begun(config, folder, resume=resume, stop=stop) as course:
-        yield course
+    with exits_refused(), _zero_exits_told(), _begun(config, folder, resume=resume, stop=stop) as active:
+        yield active
 
 
 @contextlib.contextmanager
-def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[Course]:
+def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
     ledger, spec = Ledger(folder), spec_of(config)
     config = resolved(config, spec)
@@ -159,12 +159,12 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
         status = _claim(config, setup, writer)
-        course = Course(config, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
-        if course.outcome.already_done:
-            yield course
+        active = ActiveRun(config, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
+        if active.outcome.already_done:
+            yield active
             return
         stop.watch(ledger.stop_file, config.resources.grace_seconds)
-        course.pusher = _start_pusher(config, ledger)
+        active.pusher = _start_pusher(config, ledger)
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
@@ -175,8 +175,8 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
                 log.warning("%s", remark)
             log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
-            course.raise_if_stopped()  # before Ray is started
-            yield course
+            active.raise_if_stopped()  # before Ray is started
+            yield active
 
 
 def _refuse_other_arithmetic(config: RunConfig) -> None:
@@ -353,18 +353,18 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
 
 
 @contextlib.contextmanager
-def _cluster(course: Course) -> Iterator[Cluster]:
-    if course.config.resources.workers == 0:
-        with contextlib.closing(InProcess(course.config, course.setup)) as here:
+def _cluster(active: ActiveRun) -> Iterator[Cluster]:
+    if active.config.resources.workers == 0:
+        with contextlib.closing(InProcess(active.config, active.setup)) as here:
             yield here
         return
-    if course.config.resources.address == "local":
+    if active.config.resources.address == "local":
         private_ray()
     from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
-        with course.stop.standing():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(course.config, course.setup, course.raise_if_stopped, course.note))
+        with active.stop.standing():  # ray.init would replace SIGTERM's handler
+            cluster = stack.enter_context(RayCluster(active.config, active.setup, active.raise_if_stopped, active.note))
         yield cluster
 
 

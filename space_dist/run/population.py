@@ -1,6 +1,6 @@
 """Many runs of one shape in one process, side by side: collected, measured and updated together.
 
-Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a course (`member`) that says
+Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a generator (`member`) that says
 what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch of
 environments, and once every member waits for its update, all are made in one tensor program. A member's bits do not
 depend on its companions, so members may be put together in any way, end when they end, and be resumed among others.
@@ -35,11 +35,11 @@ _KEPT = 4  # batches of environments that are kept, beside those in which episod
 
 def member(config: RunConfig, folder: Path, *, stop: StopRequests) -> Work[Outcome]:
     """One run of a population, to its end or from where it stopped; raises as `launch` does."""
-    with begun(config, folder, resume=True, stop=StopRequests(stop)) as course:
-        if not course.outcome.already_done:
-            with contextlib.closing(_Promising(config, course.setup, folder)) as cluster:
-                yield from course.training(cluster).work()
-    return course.finished()
+    with begun(config, folder, resume=True, stop=StopRequests(stop)) as active:
+        if not active.outcome.already_done:
+            with contextlib.closing(_Promising(config, active.setup, folder)) as cluster:
+                yield from active.training(cluster).work()
+    return active.finished()
 
 
 def advance(

@@ -58,7 +58,7 @@ from space_dist.rollout.policy import Valuing
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.run.cluster import CurriculumHost, Evidence
 from space_dist.sb3.script import Scored, Wrapped, gradient_steps, network, refuse_model, weights, with_weights
-from space_dist.sb3.vec_env import ContextVecEnv, Course
+from space_dist.sb3.vec_env import ContextVecEnv, RoundPlan
 from space_dist.seeding import Purpose, episode_seeds, global_generators, global_seeds
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class Session:
         self._shape_rounds()
         self._restored_random: Mapping[str, Any] | None = None  # to go on with, behind the next `begin_round`
         self._open = False  # whether a rollout is being collected
-        self._course: Course | None = None  # of the round that is played
+        self._plan: RoundPlan | None = None  # of the round that is played
         self._sizes_now: list[FloatArray] = []  # |GAE| of this round's rollouts
         self._make()
         self.round = 0
@@ -269,7 +269,7 @@ class Session:
     @property
     def _plays(self) -> bool:
         """Whether the environment is in the midst of this session's round: others may have used it meanwhile."""
-        return self.env.driven and self.env.course is self._course
+        return self.env.driven and self.env.plan is self._plan
 
     def on_rollout_start(self) -> bool:
         """Begin a round where the last one is over; returns whether there was a decision."""
@@ -311,8 +311,8 @@ class Session:
         if unfinished is not None and len(unfinished.ids) != env.num_envs:  # saved with another number of them
             unfinished, self.sizes = None, None
         start = walk.position(self.selection, 0, 1)
-        self._course = Course(self.selection, start, self._gamma, env.run_seed, self.round, unfinished)
-        current = env.begin_round(self._course, length=self._length, record=self._ensemble is not None)
+        self._plan = RoundPlan(self.selection, start, self._gamma, env.run_seed, self.round, unfinished)
+        current = env.begin_round(self._plan, length=self._length, record=self._ensemble is not None)
         self.wrapped.put(self._model, current)
         self._sizes_now = []
 

@@ -36,7 +36,7 @@ _FREE_STEPS = 1024  # of such a round
 
 
 @dataclass(frozen=True)
-class Course:
+class RoundPlan:
     """A round of one shard: see `rollout.Route`."""
 
     selection: Selection
@@ -113,23 +113,23 @@ class ContextVecEnv(VecEnv):
 
     # ---- rounds ----
 
-    def begin_round(self, course: Course, *, length: int, record: bool = False, driven: bool = True) -> Observations:
-        """Go on with what of `course` is unfinished, and play its selection, for `length` steps of all slots at most.
+    def begin_round(self, plan: RoundPlan, *, length: int, record: bool = False, driven: bool = True) -> Observations:
+        """Go on with what of `plan` is unfinished, and play its selection, for `length` steps of all slots at most.
 
         record: keep the observations. Returns (n_envs, ...) where all slots stand. Raises SpaceDistError if an episode
         that has to be played again goes another way.
         """
         env, slots = self._batched, self.num_envs
-        self.course, self._length, self._record, self.driven = course, length, record, driven
-        self._ended, self._left = False, course.unfinished
-        self._walking = Walking([course], slots, length + 1)  # what ends with the last step begins another
-        self._table = EpisodeTable([course], slots)
+        self.plan, self._length, self._record, self.driven = plan, length, record, driven
+        self._ended, self._left = False, plan.unfinished
+        self._walking = Walking([plan], slots, length + 1)  # what ends with the last step begins another
+        self._table = EpisodeTable([plan], slots)
         self.time = 0
         self._observed: list[Observations] = []
         self._truncated_observed: list[Observations] = []
         self._executed: list[NDArray[Any]] = []
         self._steps: list[tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]] = []
-        live = self._stage.resume([course.unfinished])
+        live = self._stage.resume([plan.unfinished])
         self._current = live if live is not None else replayed(env, self._table)
         self.starts = ~self._table.runs
         """(n_envs,) whether a slot's first step in this round begins an episode."""
@@ -142,7 +142,7 @@ class ContextVecEnv(VecEnv):
         Episodes that had begun and made no step are not part of it: the next round begins others in their slots.
         Observations have length 0 where they were not recorded.
         """
-        table, length, course = self._table, len(self._executed), self.course
+        table, length, plan = self._table, len(self._executed), self.plan
         fresh = table.runs & (table.lengths(length) == 0)
         table.runs[fresh] = False
         (episodes,) = table.episodes(1)
@@ -156,8 +156,8 @@ class ContextVecEnv(VecEnv):
         self._stage.leave([unfinished], self._current)
         self.driven, self._ended, self._length, self._left = False, True, length, unfinished
         return Shard(
-            shard=course.shard, round=course.round, policy_version=course.round,
-            selection_version=course.selection.version, order_version=course.selection.order_version,
+            shard=plan.shard, round=plan.round, policy_version=plan.round,
+            selection_version=plan.selection.version, order_version=plan.selection.order_version,
             observations=observations, actions=np.stack(self._executed), rewards=rewards, terminated=terminated,
             truncated=truncated, starts=self.starts, last_observations=take(self._current, slice(None)),
             truncated_observations=concatenate(lasts) if lasts else allocate(space, 0), next_observations=None,
@@ -167,14 +167,14 @@ class ContextVecEnv(VecEnv):
     def _walk_on(self, unfinished: Unfinished | None) -> None:
         """Begin a round that nobody drives."""
         ids, contexts = self.instances.ids, self.instances.contexts
-        course = Course(
+        plan = RoundPlan(
             Selection(0, ids, contexts, 0), self._free_start, 1.0, self.run_seed, _FREE + self._free_rounds, unfinished
         )
         self._free_rounds += 1
-        self.begin_round(course, length=_FREE_STEPS, driven=False)
+        self.begin_round(plan, length=_FREE_STEPS, driven=False)
 
     def _start(self, slots: NDArray[np.int64]) -> None:
-        """Begin the next episodes of the course in `slots` (k,), which ascend."""
+        """Begin the next episodes of the plan in `slots` (k,), which ascend."""
         if not len(slots):
             return
         ids, contexts, seeds = self._walking.next(slots)
