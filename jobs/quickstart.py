@@ -13,7 +13,7 @@ from space_dist.cli.grids import frozen, run_frozen, tell
 from space_dist.cli.runs import print_grid_report
 from space_dist.cli.terminal import STOP, console, say, warn
 from space_dist.errors import Interrupted, SpaceDistError
-from space_dist.experiment.status import Standing
+from space_dist.experiment.status import RunStatus
 
 ROOT = Path(__file__).resolve().parent.parent
 INSTANCES = 100
@@ -34,8 +34,8 @@ def main() -> int:
 
     report = build_grid_report(place)
     print_grid_report(report, console)
-    of_space = [standing for standing in found if standing.run.cell.settings["curriculum"]["kind"] == "space"]
-    reached = [standing for standing in of_space if _reached_all(standing)]
+    of_space = [run_status for run_status in found if run_status.run.cell.settings["curriculum"]["kind"] == "space"]
+    reached = [run_status for run_status in of_space if _reached_all(run_status)]
     say(
         f"SPaCE's set reached all {INSTANCES} instances in {len(reached)} of {len(of_space)} runs"
         + ("" if len(reached) == len(of_space) else ": the start's value settles too slowly for this short budget")
@@ -45,8 +45,8 @@ def main() -> int:
     return 0
 
 
-def _reached_all(standing: Standing) -> bool:
-    rows = standing.ledger.rows()
+def _reached_all(run_status: RunStatus) -> bool:
+    rows = run_status.ledger.rows()
     return any(row["kind"] == "iteration" and row["curriculum"].get("size") == INSTANCES for row in rows)
 
 

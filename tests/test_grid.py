@@ -23,7 +23,15 @@ from space_dist import config as configs
 from space_dist.errors import ConfigError, Interrupted, LedgerError
 from space_dist.experiment.endings import Busy, Cause, Ended, Evidence
 from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, find_grid
-from space_dist.experiment.status import Attempts, concluded, exit_code, last_lines, settled, standing_of, standings
+from space_dist.experiment.status import (
+    Attempts,
+    concluded,
+    exit_code,
+    last_lines,
+    run_status_of,
+    run_statuses,
+    settled,
+)
 from space_dist.grid import supervisor
 from space_dist.grid.conductor import Conductor
 from space_dist.grid.planning import plan
@@ -277,7 +285,7 @@ def test_ten_thousand_runs_are_planned_and_shown(tmp_path: Path) -> None:
         tmp_path, grid={"curriculum.kappa": kappas, "curriculum.eta": etas}, seeds={"count": 10}
     )  # fmt: skip
     made = plan(path, tmp_path / "runs")
-    found = standings(made.grid, made.manifest, CODE)
+    found = run_statuses(made.grid, made.manifest, CODE)
     assert (len(made.manifest.cells), len(found), exit_code(found)) == (1000, 10_000, 3)
     assert len({cell.id for cell in made.manifest.cells}) == len({cell.label for cell in made.manifest.cells}) == 1000
 
@@ -291,35 +299,35 @@ def one(tmp_path: Path) -> tuple[Grid, Manifest, Run]:
     return made.grid, made.manifest, made.manifest.runs()[0]
 
 
-def standing(one: tuple[Grid, Manifest, Run]) -> tuple[str, Cause | None]:
+def run_status(one: tuple[Grid, Manifest, Run]) -> tuple[str, Cause | None]:
     grid, manifest, run = one
-    found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
+    found = run_status_of(run, grid.ledger(run), manifest.retry, CODE)
     return found.condition, found.cause
 
 
 def test_conditions_follow_the_history_of_attempts(one: tuple[Grid, Manifest, Run]) -> None:
     grid, _, run = one
     attempts = Attempts(grid.ledger(run))
-    assert standing(one) == ("waiting", None)
+    assert run_status(one) == ("waiting", None)
     attempts.begin(1, {})
-    assert standing(one) == ("running", None)  # this process has begun it, and lives
+    assert run_status(one) == ("running", None)  # this process has begun it, and lives
     attempts.end(1, Ended(Cause.CRASH, "oh"))
-    assert standing(one) == ("waiting", Cause.CRASH)
+    assert run_status(one) == ("waiting", Cause.CRASH)
     attempts.begin(2, {})
     attempts.end(2, Ended(Cause.PREEMPTED))
-    assert standing(one) == ("waiting", Cause.PREEMPTED)
+    assert run_status(one) == ("waiting", Cause.PREEMPTED)
     attempts.begin(3, {})
     attempts.end(3, Ended(Cause.CRASH, "oh again"))
-    assert standing(one) == ("failed", Cause.CRASH)
+    assert run_status(one) == ("failed", Cause.CRASH)
     attempts.forgive()
-    assert standing(one) == ("waiting", None)
+    assert run_status(one) == ("waiting", None)
     attempts.end(4, Ended(Cause.KILLED))
-    assert standing(one) == ("failed", Cause.KILLED)
+    assert run_status(one) == ("failed", Cause.KILLED)
     attempts.forgive()
     attempts.end(5, Ended(Cause.CONFIG_ERROR, "bad"))
-    assert standing(one) == ("failed", Cause.CONFIG_ERROR)
+    assert run_status(one) == ("failed", Cause.CONFIG_ERROR)
     attempts.end(6, Ended(Cause.STOPPED))
-    assert standing(one) == ("waiting", Cause.STOPPED)
+    assert run_status(one) == ("waiting", Cause.STOPPED)
 
 
 def test_a_supervisor_that_is_gone_leaves_a_killed_run(one: tuple[Grid, Manifest, Run]) -> None:
@@ -331,7 +339,7 @@ from space_dist.experiment.status import Attempts
 Attempts(Ledger({str(grid.ledger(run).folder)!r})).begin(1, {{}})
 """
     subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    assert standing(one) == ("waiting", Cause.KILLED)
+    assert run_status(one) == ("waiting", Cause.KILLED)
 
 
 def test_torn_and_foreign_rows_are_passed_over(one: tuple[Grid, Manifest, Run]) -> None:
@@ -356,7 +364,7 @@ def test_a_damaged_status_is_a_failure_that_says_so(one: tuple[Grid, Manifest, R
     ledger = grid.ledger(run)
     ledger.folder.mkdir(parents=True)
     ledger.status_file.write_text("{}")
-    found = standing_of(run, ledger, manifest.retry, CODE)
+    found = run_status_of(run, ledger, manifest.retry, CODE)
     assert (found.condition, "damaged" in found.detail) == ("failed", True)
 
 
@@ -453,12 +461,12 @@ def test_causes_are_told_apart_and_retries_finish_the_run(
     first = supervised.attempt(grid, run)
     assert (first["cause"], first["busy"]) == (cause, False)
     assert words in first["detail"]
-    found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
+    found = run_status_of(run, grid.ledger(run), manifest.retry, CODE)
     retried = cause in (Cause.KILLED, Cause.PREEMPTED)
     assert (found.condition, found.cause) == ("waiting" if retried else "failed", cause)
     again = supervised.attempt(grid, run, 2)
     assert again["cause"] is None, again
-    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
+    assert run_status_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
     assert grid.ledger(run).rows(METRICS) == unharmed
 
 
@@ -468,7 +476,7 @@ def test_a_run_whose_environment_forks_is_done_once(
     grid, manifest, run = faulty(tmp_path, "fork", str(tmp_path / "marker"))
     assert supervised.attempt(grid, run)["cause"] is None
     assert (tmp_path / "marker").exists()
-    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
+    assert run_status_of(run, grid.ledger(run), manifest.retry, CODE).condition == "done"
     assert grid.ledger(run).rows(METRICS) == unharmed
 
 
@@ -482,7 +490,7 @@ def test_nobody_is_believed_to_be_done_whose_ledger_is_not(tmp_path: Path, monke
     folder, attempt = str(grid.folder), supervisor.AttemptId(run.cell.id, run.seed, 1)
     [ended] = supervisor.Supervisor().attempt(supervisor.Task(folder, (attempt,)), lambda: None)
     assert (ended.cause, "and is not" in ended.detail) == (Cause.CRASH, True)
-    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "failed"
+    assert run_status_of(run, grid.ledger(run), manifest.retry, CODE).condition == "failed"
 
 
 def test_a_run_that_others_work_on_is_left_alone(supervised: Supervised, tmp_path: Path) -> None:
@@ -503,7 +511,7 @@ def test_a_stop_makes_a_checkpoint_and_the_run_goes_on(supervised: Supervised, t
     supervised.send({"stop": "stopped"})
     (ended,) = supervised.read()["ends"]
     assert ended["cause"] in ("stopped", None)  # None: it was done before it heard
-    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition in ("waiting", "done")
+    assert run_status_of(run, grid.ledger(run), manifest.retry, CODE).condition in ("waiting", "done")
     assert supervised.attempt(grid, run, 2)["cause"] is None
 
 
@@ -519,7 +527,7 @@ def test_a_run_stops_when_its_supervisor_is_killed(tmp_path: Path) -> None:
     lonely.process.wait()
     while grid.ledger(run).owner_alive() and time.monotonic() < deadline:
         time.sleep(0.1)
-    found = standing_of(run, grid.ledger(run), manifest.retry, CODE)
+    found = run_status_of(run, grid.ledger(run), manifest.retry, CODE)
     assert (found.condition, found.cause) == ("waiting", Cause.KILLED)
 
 
@@ -582,7 +590,7 @@ def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
     lonely.process.kill()
     lonely.process.wait()
     assert attempts.history().abandoned
-    assert standing_of(run, grid.ledger(run), manifest.retry, CODE).condition == "running"
+    assert run_status_of(run, grid.ledger(run), manifest.retry, CODE).condition == "running"
     monkeypatch.setattr("space_dist.grid.conductor._ABANDONED_SECONDS", 0.5)
     monkeypatch.setattr("space_dist.grid.conductor._ELSEWHERE_SECONDS", 0.1)
     script, began = Script(grid, {}), time.monotonic()
@@ -601,7 +609,7 @@ def test_a_done_run_whose_supervisor_died_before_it_said_so_has_its_end_written_
     attempts = Attempts(grid.ledger(run))
     begin, process, _ = attempts.path.read_bytes().splitlines(keepends=True)
     attempts.path.write_bytes(begin + process)
-    assert not standing_of(run, grid.ledger(run), manifest.retry, CODE).told
+    assert not run_status_of(run, grid.ledger(run), manifest.retry, CODE).told
 
     def conduct() -> Script:
         script = Script(grid, {})
@@ -665,7 +673,7 @@ def test_the_conductor_retries_by_cause_and_never_starts_more_than_fits(tmp_path
     Conductor(grid, manifest, runs, script, stop_requested=lambda: None).conduct()
     assert [script.started.count(run.key) for run in runs] == [2, 1, 2, 1]
     assert script.most == 2
-    found = [standing_of(run, grid.ledger(run), manifest.retry, CODE).cause for run in runs[1:]]
+    found = [run_status_of(run, grid.ledger(run), manifest.retry, CODE).cause for run in runs[1:]]
     assert found == [Cause.CRASH, Cause.KILLED, Cause.CONFIG_ERROR]
     again = Script(grid, {})
     Conductor(grid, manifest, runs[1:], again, stop_requested=lambda: None).conduct()
@@ -838,7 +846,7 @@ def test_members_of_a_population_end_each_for_itself(supervised: Supervised, tmp
         (None, False), ("crash", False), (None, True), (None, False)
     ]  # fmt: skip
     assert "diverged" in ends[1]["detail"]
-    found = [standing_of(run, grid.ledger(run), made.manifest.retry, CODE).condition for run in runs]
+    found = [run_status_of(run, grid.ledger(run), made.manifest.retry, CODE).condition for run in runs]
     assert found == ["done", "failed", "waiting", "done"]
     assert "diverged" in grid.ledger(runs[1]).log.read_text()
     assert "diverged" not in grid.ledger(runs[0]).log.read_text()

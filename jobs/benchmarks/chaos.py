@@ -41,7 +41,7 @@ from benchmarks.servers import RayHead, TrackingServer, until
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError, nearest
 from space_dist.experiment.manifest import Grid, Run
-from space_dist.experiment.status import Attempts, standing_of
+from space_dist.experiment.status import Attempts, run_status_of
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, Status
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -385,7 +385,7 @@ class _Rehearsal:
 
     def _failed(self) -> list[str]:
         retry = self._grid.manifest().retry
-        found = [standing_of(run, self._grid.ledger(run), retry, "") for run in self._all()]
+        found = [run_status_of(run, self._grid.ledger(run), retry, "") for run in self._all()]
         return [one.in_words for one in found if one.condition == "failed"]
 
     # ---- where the work stands ----

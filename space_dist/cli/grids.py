@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ray.job_submission import JobDetails
 
     from space_dist.experiment.manifest import Grid, Manifest, Run
-    from space_dist.experiment.status import Standing
+    from space_dist.experiment.status import RunStatus
     from space_dist.grid.conductor import Overview
     from space_dist.grid.jobs import Mode, Remote
     from space_dist.slurm.queue import Queue
@@ -56,15 +56,15 @@ _UNFINISHED = 3
 @grid_app.command("plan")
 def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
     """Check a grid, print its cells and what is done already, and freeze its manifest."""
-    from space_dist.experiment.status import standings
+    from space_dist.experiment.status import run_statuses
     from space_dist.grid.planning import plan
     from space_dist.system.provenance import code_digest
 
     made = plan(grid, _root(root))
     manifest = made.manifest
-    found = standings(made.grid, manifest, code_digest())
-    done = [standing for standing in found if standing.condition == "done"]
-    left = sum(standing.budget_steps for standing in found) - sum(standing.steps for standing in found)
+    found = run_statuses(made.grid, manifest, code_digest())
+    done = [run_status for run_status in found if run_status.condition == "done"]
+    left = sum(run_status.budget_steps for run_status in found) - sum(run_status.steps for run_status in found)
     if as_json:
         _print_json({
             "grid": manifest.name, "folder": str(made.grid.folder), "seeds": list(manifest.seeds), "runs": len(found),
@@ -80,7 +80,7 @@ def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
         f"steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
         + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )
-    other = sum(standing.other_code for standing in done)
+    other = sum(run_status.other_code for run_status in done)
     say(f"done already: {len(done)} runs" + (f", {other} of them by another version of this package" if other else ""))
     if made.dropped_runs:
         say(f"{made.dropped_runs} runs of the grid as it was frozen before are no longer in it; their folders are kept")
@@ -165,8 +165,8 @@ def grid_submit(
         say(f"`space-dist grid status {place.folder}` tells how far it is, `grid submit` again looks on")
         return
     code = remote.follow(job, say, STOP.reason)
-    found = _standings(place, manifest)
-    if not any(standing.attempts or standing.steps for standing in found):
+    found = _run_statuses(place, manifest)
+    if not any(run_status.attempts or run_status.steps for run_status in found):
         warn(
             f"{place.folder} shows no run of it: it is not on the cluster's storage. What is seen from here is "
             "limited to what the conductor said above"
@@ -195,7 +195,7 @@ def grid_status(
     while True:
         if time.monotonic() - asked >= _QUEUE_SECONDS:  # a controller serves everybody
             queue, asked = queue_of(place.folder), time.monotonic()
-        found = _standings(place, manifest)
+        found = _run_statuses(place, manifest)
         if as_json:
             _print_json(_status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
@@ -204,7 +204,7 @@ def grid_status(
             _print_cells(manifest, found)
             _print_failures(found, by_cause)
             say(_summary(manifest, found) + _workers_in_words(place, queue))
-        if not watch or output_left() or all(standing.condition in ("done", "failed") for standing in found):
+        if not watch or output_left() or all(run_status.condition in ("done", "failed") for run_status in found):
             raise typer.Exit(exit_code(found))
         time.sleep(_WATCH_SECONDS)
 
@@ -225,15 +225,17 @@ def grid_logs(
     ledger = place.ledger(run)
     offsets = {ledger.log: 0, ledger.folder / OUTPUT: 0}
     while True:
-        [standing] = _standings(place, manifest, [run])
+        [run_status] = _run_statuses(place, manifest, [run])
         for path in offsets:
             offsets[path] = _print_from(path, offsets[path])
-        if not follow or output_left() or standing.condition in ("done", "failed"):
+        if not follow or output_left() or run_status.condition in ("done", "failed"):
             break
         time.sleep(_WATCH_SECONDS)
-    warn(f"{run.title}: {standing.in_words}, {standing.steps:,} of {standing.budget_steps:,} steps. {ledger.folder}")
-    if standing.detail and standing.condition != "done":
-        warn(standing.detail)
+    warn(
+        f"{run.title}: {run_status.in_words}, {run_status.steps:,} of {run_status.budget_steps:,} steps. {ledger.folder}"
+    )
+    if run_status.detail and run_status.condition != "done":
+        warn(run_status.detail)
 
 
 @grid_app.command("stop")
@@ -251,14 +253,14 @@ def grid_stop(
         remote.stop(str(conductor.submission_id))
         say(f"{manifest.name}: job {conductor.submission_id} was asked to stop its runs, and itself")
         return
-    live = [standing for standing in _standings(place, manifest) if standing.condition == "running"]
+    live = [run_status for run_status in _run_statuses(place, manifest) if run_status.condition == "running"]
     queue = queue_of(place.folder)
     if not live and not place.owner_alive() and not (queue and queue.live):
         say(f"{manifest.name}: nothing is running")
         return
     place.stop_file.touch()
-    for standing in live:  # those nobody conducts any more, too
-        standing.ledger.stop_file.touch()
+    for run_status in live:  # those nobody conducts any more, too
+        run_status.ledger.stop_file.touch()
     say(f"{manifest.name}: {len(live)} runs were asked to make a checkpoint and end")
     if queue and queue.live:
         say("SLURM jobs that still wait will end as soon as they start; scancel removes them")
@@ -279,11 +281,11 @@ def grid_retry(
     for name in sorted(causes):
         one_of(known, name, "--cause")
     place, manifest = _found(grid, root)
-    chosen = [standing for standing in _standings(place, manifest)
-              if standing.condition == "failed" and standing.cause in causes]  # fmt: skip
-    for standing in chosen:
-        Attempts(standing.ledger).forgive()
-        say(f"{standing.run.title}: {standing.in_words}; it will be tried again")
+    chosen = [run_status for run_status in _run_statuses(place, manifest)
+              if run_status.condition == "failed" and run_status.cause in causes]  # fmt: skip
+    for run_status in chosen:
+        Attempts(run_status.ledger).forgive()
+        say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
     follow_up = "" if not chosen else f"; `space-dist grid run {place.folder}` or `grid submit` does it"
     say(f"{len(chosen)} runs may be tried again{follow_up}")
 
@@ -324,7 +326,7 @@ def grid_work(
 def run_frozen(
     place: Grid, manifest: Manifest, *, address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
     nodes: int = 1, part: str | None = None,
-) -> list[Standing]:  # fmt: skip
+) -> list[RunStatus]:  # fmt: skip
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
     _prepare(address)
     from space_dist.grid.conductor import Conductor, working_on
@@ -411,11 +413,11 @@ def _part(runs: list[Run], part: str | None) -> list[Run]:
     return runs[int(first) : int(last) + 1]
 
 
-def _standings(place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None) -> list[Standing]:
-    from space_dist.experiment.status import standings
+def _run_statuses(place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None) -> list[RunStatus]:
+    from space_dist.experiment.status import run_statuses
     from space_dist.system.provenance import code_digest
 
-    return standings(place, manifest, code_digest(), runs)
+    return run_statuses(place, manifest, code_digest(), runs)
 
 
 def _log_to(place: Grid) -> None:
@@ -479,18 +481,18 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
     return table
 
 
-def _print_cells(manifest: Manifest, found: Sequence[Standing]) -> None:
+def _print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
     """One line for each cell: how its seeds stand."""
     table = Table(title=Text(manifest.name), title_justify="left")
     for column in ("cell", "id", "done", "running", "waiting", "failed", "steps"):
         table.add_column(column, justify="left" if column in ("cell", "id") else "right")
-    of_cell: dict[str, list[Standing]] = {cell.id: [] for cell in manifest.cells}
-    for standing in found:
-        of_cell[standing.run.cell.id].append(standing)
+    of_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
+    for run_status in found:
+        of_cell[run_status.run.cell.id].append(run_status)
     for cell in manifest.cells:
-        counts = Counter(standing.condition for standing in of_cell[cell.id])
-        steps = sum(standing.steps for standing in of_cell[cell.id])
-        of_all = sum(standing.budget_steps for standing in of_cell[cell.id])
+        counts = Counter(run_status.condition for run_status in of_cell[cell.id])
+        steps = sum(run_status.steps for run_status in of_cell[cell.id])
+        of_all = sum(run_status.budget_steps for run_status in of_cell[cell.id])
         table.add_row(
             Text(cell.label), cell.id, f"{counts['done']}/{len(of_cell[cell.id])}",
             *(str(counts[condition]) if counts[condition] else "" for condition in ("running", "waiting", "failed")),
@@ -499,30 +501,32 @@ def _print_cells(manifest: Manifest, found: Sequence[Standing]) -> None:
     console.print(table)
 
 
-def _print_failures(found: Sequence[Standing], by_cause: bool) -> None:
-    unwell = [standing for standing in found if standing.cause is not None and standing.condition != "done"]
+def _print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
+    unwell = [run_status for run_status in found if run_status.cause is not None and run_status.condition != "done"]
     if by_cause:
-        for cause, count in sorted(Counter(standing.cause for standing in unwell if standing.cause).items()):
+        for cause, count in sorted(Counter(run_status.cause for run_status in unwell if run_status.cause).items()):
             say(f"{cause.in_words}: {count}")
-            for standing in unwell:
-                if standing.cause is cause:
-                    say(f"  {standing.run.title} ({standing.run.cell.id}): {standing.condition}; {_last(standing)}")
+            for run_status in unwell:
+                if run_status.cause is cause:
+                    say(
+                        f"  {run_status.run.title} ({run_status.run.cell.id}): {run_status.condition}; {_last(run_status)}"
+                    )
         return
-    for standing in unwell[:_SHOWN_RUNS]:
-        say(f"{standing.run.title}: {standing.in_words}; {_last(standing)}")
+    for run_status in unwell[:_SHOWN_RUNS]:
+        say(f"{run_status.run.title}: {run_status.in_words}; {_last(run_status)}")
     if len(unwell) > _SHOWN_RUNS:
         say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
 
 
-def _last(standing: Standing) -> str:
-    lines = standing.detail.splitlines()
+def _last(run_status: RunStatus) -> str:
+    lines = run_status.detail.splitlines()
     return lines[0][:300] if lines else "no more is known"
 
 
-def _summary(manifest: Manifest, found: Sequence[Standing]) -> str:
-    counts = Counter(standing.condition for standing in found)
+def _summary(manifest: Manifest, found: Sequence[RunStatus]) -> str:
+    counts = Counter(run_status.condition for run_status in found)
     parts = [f"{counts[condition]} {condition}" for condition in ("running", "waiting", "failed") if counts[condition]]
-    other = sum(standing.other_code for standing in found)
+    other = sum(run_status.other_code for run_status in found)
     parts += [f"{other} of the done ones by another version of this package"] if other else []
     return ", ".join([f"{manifest.name}: {counts['done']} of {len(found)} runs done", *parts])
 
@@ -533,7 +537,7 @@ def _workers_in_words(place: Grid, queue: Queue | None) -> str:
     return "" if place.owner_alive() else "; nobody is working on it now"
 
 
-def tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
+def tell(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> int:
     """Say how a grid ended; returns the exit code."""
     from space_dist.experiment.status import exit_code
 
@@ -542,18 +546,18 @@ def tell(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> int:
     return exit_code(found)
 
 
-def _status_json(manifest: Manifest, place: Grid, found: Sequence[Standing]) -> dict[str, Any]:
+def _status_json(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> dict[str, Any]:
     return {
         "grid": manifest.name, "folder": str(place.folder), "owner_alive": place.owner_alive(),
-        "counts": dict(Counter(standing.condition for standing in found)),
+        "counts": dict(Counter(run_status.condition for run_status in found)),
         "runs": [
             {
-                "cell": standing.run.cell.id, "label": standing.run.cell.label, "seed": standing.run.seed,
-                "condition": standing.condition, "cause": standing.cause, "detail": standing.detail,
-                "steps": standing.steps, "budget_steps": standing.budget_steps, "attempts": standing.attempts,
-                "other_code": standing.other_code, "folder": str(standing.ledger.folder),
+                "cell": run_status.run.cell.id, "label": run_status.run.cell.label, "seed": run_status.run.seed,
+                "condition": run_status.condition, "cause": run_status.cause, "detail": run_status.detail,
+                "steps": run_status.steps, "budget_steps": run_status.budget_steps, "attempts": run_status.attempts,
+                "other_code": run_status.other_code, "folder": str(run_status.ledger.folder),
             }
-            for standing in found
+            for run_status in found
         ],
     }  # fmt: skip
 

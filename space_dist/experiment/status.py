@@ -146,7 +146,7 @@ Condition = Literal["done", "running", "waiting", "failed"]
 
 
 @dataclass(frozen=True)
-class Standing:
+class RunStatus:
     """Where one run stands.
 
     condition: `waiting` runs will be started, or go on, when somebody works on the grid; `failed` ones will not.
@@ -177,7 +177,7 @@ class Standing:
         return f"{self.condition}: {self.cause.in_words}"
 
 
-def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
+def run_status_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> RunStatus:
     """Where a run stands now. `code` is this package's digest. A damaged ledger is a failed run that says so."""
     history = Attempts(ledger).history()
     budget = run.cell.budget_steps
@@ -185,25 +185,25 @@ def standing_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> Standing:
         status = ledger.status() if ledger.status_file.exists() else None
     except LedgerError as error:
         damaged = why_ended(Evidence(damage=str(error)))
-        return Standing(run, ledger, "failed", 0, budget, history.begun, damaged.cause, damaged.detail)
+        return RunStatus(run, ledger, "failed", 0, budget, history.begun, damaged.cause, damaged.detail)
     steps = status.steps if status is not None else 0
     if status is not None and status.state == "done":
-        return Standing(
+        return RunStatus(
             run, ledger, "done", steps, budget, history.begun,
             other_code=status.fingerprint.get("code") != code, fingerprint_changed=status.fingerprint_changed,
             told=history.last is not None or not history.begun, supervised=believed_alive(history.where),
         )  # fmt: skip
     if status is not None and ledger.owner_alive():
-        return Standing(run, ledger, "running", steps, budget, history.begun)
+        return RunStatus(run, ledger, "running", steps, budget, history.begun)
     last = history.last
     if last is None and history.begun and believed_alive(history.where):  # it loads its libraries
-        return Standing(run, ledger, "running", steps, budget, history.begun)
+        return RunStatus(run, ledger, "running", steps, budget, history.begun)
     if last is None and history.begun:  # its supervisor is gone, and told nobody why
         last = why_ended(Evidence(began_on=str(history.where.get("host", "an unknown host"))))
     if last is None or last.cause is None:
-        return Standing(run, ledger, "waiting", steps, budget, history.begun)
+        return RunStatus(run, ledger, "waiting", steps, budget, history.begun)
     condition: Condition = "waiting" if may_retry(last.cause, history.ends, retry) else "failed"
-    return Standing(run, ledger, condition, steps, budget, history.begun, last.cause, last.detail)
+    return RunStatus(run, ledger, condition, steps, budget, history.begun, last.cause, last.detail)
 
 
 def is_done(ledger: Ledger) -> bool:
@@ -248,15 +248,15 @@ def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:
     return ends.get(cause, 0) <= int(allowed[cause])
 
 
-def standings(grid: Grid, manifest: Manifest, code: str, runs: Sequence[Run] | None = None) -> list[Standing]:
+def run_statuses(grid: Grid, manifest: Manifest, code: str, runs: Sequence[Run] | None = None) -> list[RunStatus]:
     """Where every run stands, in the manifest's order (or those of `runs`)."""
     chosen = manifest.runs() if runs is None else runs
-    return [standing_of(run, grid.ledger(run), manifest.retry, code) for run in chosen]
+    return [run_status_of(run, grid.ledger(run), manifest.retry, code) for run in chosen]
 
 
-def exit_code(found: Sequence[Standing]) -> int:
+def exit_code(found: Sequence[RunStatus]) -> int:
     """0: all done.  1: some have failed.  3: some are not done yet."""
-    conditions = {standing.condition for standing in found}
+    conditions = {run_status.condition for run_status in found}
     if "failed" in conditions:
         return 1
     return 3 if conditions - {"done"} else 0

@@ -23,7 +23,7 @@ from typing import Protocol
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
 from space_dist.experiment.endings import Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.experiment.status import Attempts, Standing, concluded, may_retry, standing_of, standings, unheard
+from space_dist.experiment.status import Attempts, RunStatus, concluded, may_retry, run_status_of, run_statuses, unheard
 from space_dist.ledger import Lock
 from space_dist.system.files import in_words, locked
 from space_dist.system.provenance import code_digest
@@ -142,7 +142,7 @@ class Conductor:
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
         self._overview = Overview(len(runs))
 
-    def conduct(self) -> list[Standing]:
+    def conduct(self) -> list[RunStatus]:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
         self._begin()
         looked = time.monotonic()
@@ -160,11 +160,11 @@ class Conductor:
             self._show()
             time.sleep(_TICK_SECONDS)
         self._show()
-        return self.standings()
+        return self.run_statuses()
 
-    def standings(self) -> list[Standing]:
+    def run_statuses(self) -> list[RunStatus]:
         """Where all runs stand now, by their files."""
-        return standings(self._grid, self._manifest, code_digest(), self._runs)
+        return run_statuses(self._grid, self._manifest, code_digest(), self._runs)
 
     def _begin(self) -> None:
         adopted = {run.key for run in self._executor.adopt(self._runs)}
@@ -177,21 +177,21 @@ class Conductor:
     def _place(self, run: Run, delay: float = 0.0) -> None:
         """Put a run where its files say it belongs."""
         self._elsewhere.pop(run.key, None)
-        standing = standing_of(run, self._grid.ledger(run), self._manifest.retry, code_digest())
-        if standing.condition == "running":
+        run_status = run_status_of(run, self._grid.ledger(run), self._manifest.retry, code_digest())
+        if run_status.condition == "running":
             self._elsewhere[run.key] = run
-        elif standing.condition == "waiting":
-            self._steps[run.key] = standing.steps
-            waiting = self._interrupted if standing.attempts else self._fresh
+        elif run_status.condition == "waiting":
+            self._steps[run.key] = run_status.steps
+            waiting = self._interrupted if run_status.attempts else self._fresh
             waiting.append((time.monotonic() + delay, run))
-        elif standing.condition == "failed":
+        elif run_status.condition == "failed":
             self._overview.failed += 1
-            log.warning("%s: %s: %s", run.title, standing.in_words, standing.detail)
-        elif not standing.told and standing.supervised:
+            log.warning("%s: %s: %s", run.title, run_status.in_words, run_status.detail)
+        elif not run_status.told and run_status.supervised:
             self._elsewhere[run.key] = run
         else:
-            if not standing.told:  # its supervisor died in between
-                concluded(standing.ledger, standing.attempts)
+            if not run_status.told:  # its supervisor died in between
+                concluded(run_status.ledger, run_status.attempts)
             self._overview.done += 1
 
     def _end_if_abandoned(self, run: Run) -> None:

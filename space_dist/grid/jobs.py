@@ -31,7 +31,7 @@ from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.experiment.endings import Busy, Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.experiment.status import Attempts, Standing, settled
+from space_dist.experiment.status import Attempts, RunStatus, settled
 from space_dist.grid.conductor import Conductor, Overview
 from space_dist.grid.pool import Nonce, Pool
 from space_dist.grid.supervisor import AttemptId, ray_answers
@@ -59,7 +59,7 @@ def conduct(
     grid: Grid, manifest: Manifest, runs: Sequence[Run], *, address: str, mode: Mode, max_parallel: int | None,
     nodes: int, stop_requested: Callable[[], str | None], reinstall: Callable[[], None],
     observe: Callable[[Overview], None] = lambda overview: None,
-) -> list[Standing]:  # fmt: skip
+) -> list[RunStatus]:  # fmt: skip
     """Work through `runs` on a private Ray (`address` local) or the cluster we are in; returns where they stand.
 
     max_parallel: runs at a time; None: as many as fit. nodes: how many to wait for at first. `reinstall` is called

@@ -22,7 +22,7 @@ from space_dist.config import clean, flattened
 from space_dist.errors import LedgerError
 from space_dist.experiment.endings import Evidence, why_ended
 from space_dist.experiment.manifest import Cell, Grid, Manifest
-from space_dist.experiment.status import Standing, standings
+from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.report.figures import HeatMap
 from space_dist.report.load import Configuration, FloatArray, Run, load_run
 from space_dist.report.statistics import (
@@ -45,11 +45,11 @@ MAX_NAMED: Final = 12  # runs that a sentence names
 
 @dataclass(frozen=True, eq=False)
 class CellRuns:
-    """A cell with all that its runs have left: `standings` are one a seed, `configuration` holds the runs read."""
+    """A cell with all that its runs have left: `run_statuses` are one a seed, `configuration` holds the runs read."""
 
     cell: Cell
     label: str
-    standings: tuple[Standing, ...]
+    run_statuses: tuple[RunStatus, ...]
     configuration: Configuration
     summary: Summary
 
@@ -99,12 +99,12 @@ class Comparison:
 
 def read_cells(grid: Grid, manifest: Manifest) -> list[CellRuns]:
     """Every cell with its runs, in the manifest's order. A run that cannot be read is a failed one that says why."""
-    by_cell: dict[str, list[Standing]] = {cell.id: [] for cell in manifest.cells}
+    by_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
     runs: dict[str, list[Run]] = {cell.id: [] for cell in manifest.cells}
-    for standing in standings(grid, manifest, manifest.code):
-        run, known = _read(standing)
-        by_cell[standing.run.cell.id].append(known)
-        runs[standing.run.cell.id] += [] if run is None else [run]
+    for run_status in run_statuses(grid, manifest, manifest.code):
+        run, known = _read(run_status)
+        by_cell[run_status.run.cell.id].append(known)
+        runs[run_status.run.cell.id] += [] if run is None else [run]
     labels = _labels(manifest.cells)
     configurations = [
         Configuration(labels[cell.id], tuple(runs[cell.id]), len(manifest.seeds) - len(runs[cell.id]))
@@ -118,23 +118,26 @@ def read_cells(grid: Grid, manifest: Manifest) -> list[CellRuns]:
     ]  # fmt: skip
 
 
-def _read(standing: Standing) -> tuple[Run | None, Standing]:
-    if not standing.ledger.status_file.exists():
-        return None, standing
+def _read(run_status: RunStatus) -> tuple[Run | None, RunStatus]:
+    if not run_status.ledger.status_file.exists():
+        return None, run_status
     try:
-        run = load_run(standing.ledger, standing.run.cell.config)
-        if run.status.seed != standing.run.seed:
-            raise LedgerError(f"{standing.ledger.folder} holds a run of seed {run.status.seed}")
+        run = load_run(run_status.ledger, run_status.run.cell.config)
+        if run.status.seed != run_status.run.seed:
+            raise LedgerError(f"{run_status.ledger.folder} holds a run of seed {run.status.seed}")
     except LedgerError as error:
-        if standing.condition not in ("done", "failed"):  # it is being written, or will be written anew
-            return None, dataclasses.replace(standing, detail=standing.detail or str(error))
+        if run_status.condition not in ("done", "failed"):  # it is being written, or will be written anew
+            return None, dataclasses.replace(run_status, detail=run_status.detail or str(error))
         ended = why_ended(Evidence(damage=str(error)))
         return None, dataclasses.replace(
-            standing, condition="failed", cause=standing.cause or ended.cause, detail=standing.detail or ended.detail
+            run_status,
+            condition="failed",
+            cause=run_status.cause or ended.cause,
+            detail=run_status.detail or ended.detail,
         )
-    if run.finished and standing.condition != "done":  # since we looked
-        standing = dataclasses.replace(standing, condition="done", cause=None, detail="", steps=run.status.steps)
-    return run, standing
+    if run.finished and run_status.condition != "done":  # since we looked
+        run_status = dataclasses.replace(run_status, condition="done", cause=None, detail="", steps=run.status.steps)
+    return run, run_status
 
 
 def _labels(cells: Sequence[Cell]) -> dict[str, str]:
@@ -331,14 +334,16 @@ def _heat_map(
 # ---- what the numbers alone would hide ------------------------------------------------------------------------------
 
 
-def failures(cells: Sequence[CellRuns]) -> list[tuple[CellRuns, Standing]]:
+def failures(cells: Sequence[CellRuns]) -> list[tuple[CellRuns, RunStatus]]:
     """Every run that has failed, in the order of cells and seeds."""
-    return [(cell, standing) for cell in cells for standing in cell.standings if standing.condition == "failed"]
+    return [
+        (cell, run_status) for cell in cells for run_status in cell.run_statuses if run_status.condition == "failed"
+    ]
 
 
 def missing(cell: CellRuns) -> str:
     """Which runs of a cell are not counted, and why: `1 failed: out of memory, 2 waiting`."""
-    counts = Counter(standing.in_words for standing in cell.standings if standing.condition != "done")
+    counts = Counter(run_status.in_words for run_status in cell.run_statuses if run_status.condition != "done")
     return ", ".join(f"{count} {words}" for words, count in counts.items())
 
 
@@ -384,6 +389,6 @@ def named(runs: Sequence[tuple[CellRuns, Run]]) -> str:
     return f"{len(runs):,} run{'s' if len(runs) > 1 else ''}, {'; '.join(parts)}{more}"
 
 
-def run_folder(grid: Grid, standing: Standing) -> str:
+def run_folder(grid: Grid, run_status: RunStatus) -> str:
     """A run's folder, relative to the grid's."""
-    return Path(standing.ledger.folder).relative_to(grid.folder).as_posix()
+    return Path(run_status.ledger.folder).relative_to(grid.folder).as_posix()

@@ -163,7 +163,7 @@ def _summary(
     manifest: Manifest, cells: Sequence[CellRuns], baseline: CellRuns, compared: Sequence[Comparison],
     threshold: float | None,
 ) -> list[str]:  # fmt: skip
-    counts = Counter(standing.condition for cell in cells for standing in cell.standings)
+    counts = Counter(run_status.condition for cell in cells for run_status in cell.run_statuses)
     n_runs, done = counts.total(), counts.pop("done", 0)
     size = (
         f"{len(cells):,} cell{'s' if len(cells) > 1 else ''} × {len(manifest.seeds):,} "
@@ -289,23 +289,23 @@ def _failed(cells: Sequence[CellRuns]) -> list[Section]:
     found = failures(cells)
     if not found:
         return []
-    causes = Counter(standing.cause.in_words if standing.cause else "unknown" for _, standing in found)
+    causes = Counter(run_status.cause.in_words if run_status.cause else "unknown" for _, run_status in found)
     text = [f"{len(found):,} run{'s' if len(found) > 1 else ''} failed and "
             f"{'are' if len(found) > 1 else 'is'} in no number: "
             + ", ".join(f"{count:,} {cause}" for cause, count in causes.most_common()) + "."]  # fmt: skip
     if len(found) > MAX_LISTED:
         text.append(f"The first {MAX_LISTED} follow; runs.csv lists every one.")
     rows, details = [], []
-    for cell, standing in found[:MAX_LISTED]:
-        title = f"{cell.label}, seed {standing.run.seed}"
-        lines = [clean(line) for line in standing.detail.splitlines() if line.strip()] or [""]
+    for cell, run_status in found[:MAX_LISTED]:
+        title = f"{cell.label}, seed {run_status.run.seed}"
+        lines = [clean(line) for line in run_status.detail.splitlines() if line.strip()] or [""]
         rows.append(
             {
                 "run": title,
-                "cause": standing.cause.in_words if standing.cause else "unknown",
+                "cause": run_status.cause.in_words if run_status.cause else "unknown",
                 "what it said": lines[0] or NONE,
-                "steps": f"{standing.steps:,} of {standing.budget_steps:,}",
-                "attempts": str(standing.attempts),
+                "steps": f"{run_status.steps:,} of {run_status.budget_steps:,}",
+                "attempts": str(run_status.attempts),
             }
         )
         details += [(f"{title}: all it said", "\n".join(lines))] if len(lines) > 1 else []
@@ -417,17 +417,17 @@ def _run_numbers(grid: Grid, cells: Sequence[CellRuns]) -> list[dict[str, Value]
     rows = []
     for cell in cells:
         read = {run.status.seed: run for run in cell.configuration.runs}
-        for standing in cell.standings:
-            run = read.get(standing.run.seed)
+        for run_status in cell.run_statuses:
+            run = read.get(run_status.run.seed)
             last = run if run is not None and len(run.evaluation_steps) else None
             row: dict[str, Value] = {
-                "cell": cell.cell.id, "label": cell.label, "seed": standing.run.seed, "condition": standing.condition,
-                "cause": standing.cause, "detail": " / ".join(clean(line) for line in standing.detail.splitlines()),
-                "attempts": standing.attempts, "steps": standing.steps, "budget_steps": standing.budget_steps,
+                "cell": cell.cell.id, "label": cell.label, "seed": run_status.run.seed, "condition": run_status.condition,
+                "cause": run_status.cause, "detail": " / ".join(clean(line) for line in run_status.detail.splitlines()),
+                "attempts": run_status.attempts, "steps": run_status.steps, "budget_steps": run_status.budget_steps,
                 "last_test_return": None if last is None else last.final("test", "return"),
                 "last_train_return": None if last is None else last.final("train", "return"),
                 "fingerprint_changed": None if run is None else str(run.status.fingerprint_changed).lower(),
-                "folder": run_folder(grid, standing),
+                "folder": run_folder(grid, run_status),
             }  # fmt: skip
             rows.append(row | {field: None if run is None else clean(str(run.status.fingerprint.get(field, "")))
                                for field in fields})  # fmt: skip

@@ -316,7 +316,7 @@ def fingerprint_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
     return {field: found for field, found in values.items() if len(found) > 1}
 
 
-def standing(run: Run) -> str:
+def state_in_words(run: Run) -> str:
     """Where a run stands, in words: `interrupted at 2,048 of 50,000 steps (SIGTERM)`."""
     status = run.status
     state: str = status.state

@@ -11,7 +11,15 @@ from typing import Final
 
 import numpy as np
 
-from space_dist.report.load import SPLITS, Configuration, FloatArray, Run, Split, fingerprint_differences, standing
+from space_dist.report.load import (
+    SPLITS,
+    Configuration,
+    FloatArray,
+    Run,
+    Split,
+    fingerprint_differences,
+    state_in_words,
+)
 from space_dist.report.statistics import ENOUGH, FEWEST, Estimate, Interval, estimates, intervals
 
 NONE = "—"
@@ -78,7 +86,7 @@ def remarks(configuration: Configuration) -> list[str]:
     label, lines = configuration.label, []
     unfinished = [run for run in configuration.runs if not run.finished]
     if unfinished:
-        parts = [f"seed {run.status.seed} {standing(run)}" for run in unfinished]
+        parts = [f"seed {run.status.seed} {state_in_words(run)}" for run in unfinished]
         lines.append(f"{label}, not finished and not counted: {'; '.join(parts)}.")
     lines += caveats(configuration)
     for field, values in fingerprint_differences(configuration.runs).items():

@@ -363,7 +363,7 @@ def _cluster(active: ActiveRun) -> Iterator[Cluster]:
     from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
-        with active.stop.standing():  # ray.init would replace SIGTERM's handler
+        with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler
             cluster = stack.enter_context(RayCluster(active.config, active.setup, active.raise_if_stopped, active.note))
         yield cluster
 

@@ -47,7 +47,7 @@ class StopRequests:
             signal.signal(number, self._on_signal)
 
     @contextmanager
-    def standing(self) -> Iterator[None]:
+    def keeping_handlers(self) -> Iterator[None]:
         """Keep the handlers, if they are set, while something runs that replaces them: `ray.init`, for seconds."""
         if not self._installed:
             yield

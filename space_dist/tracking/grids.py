@@ -21,7 +21,7 @@ import numpy as np
 from space_dist.errors import LedgerError
 from space_dist.experiment.endings import Cause, Evidence, why_ended
 from space_dist.experiment.manifest import Cell, Grid, Manifest, Run
-from space_dist.experiment.status import Attempts, History, Standing, standing_of
+from space_dist.experiment.status import Attempts, History, RunStatus, run_status_of
 from space_dist.ledger import METRICS, Ledger, Row, Status, decode_row
 from space_dist.system.provenance import code_digest
 from space_dist.tracking.snapshot import (
@@ -56,7 +56,7 @@ class Look:
     """
 
     files: tuple[_Signature, ...]
-    standing: Standing
+    run_status: RunStatus
     status: Status | None
     history: History
     signed_at: float
@@ -70,7 +70,7 @@ class Look:
     @property
     def news(self) -> tuple[Any, ...]:
         """Changes when there is something to push."""
-        one = self.standing
+        one = self.run_status
         return (
             one.condition, one.steps, one.attempts, one.cause, one.detail, one.other_code, self.status, self.history,
             self.signed_at, self.final, self.fault,
@@ -78,7 +78,7 @@ class Look:
 
     @property
     def running(self) -> bool:
-        return self.standing.condition == "running"
+        return self.run_status.condition == "running"
 
     @property
     def started_at(self) -> float:
@@ -91,10 +91,10 @@ class Look:
     @property
     def ending(self) -> str:
         """How the run stands, in MLflow's words."""
-        standing = self.standing
-        if standing.condition in ("done", "running"):
-            return "FINISHED" if standing.condition == "done" else "RUNNING"
-        if standing.condition == "failed" or standing.cause in _OWN_FAULTS:
+        run_status = self.run_status
+        if run_status.condition in ("done", "running"):
+            return "FINISHED" if run_status.condition == "done" else "RUNNING"
+        if run_status.condition == "failed" or run_status.cause in _OWN_FAULTS:
             return "FAILED"
         return "FAILED" if self.status is not None and self.status.state == "failed" else "KILLED"
 
@@ -135,7 +135,7 @@ class GridMirror:
         """Whether a run that was alive at the last look still is."""
         manifest, running = self._manifest, [look for look in self._looks.values() if look.running]
         return manifest is not None and any(
-            _look(look.standing.run, look.standing.ledger, manifest, look.files).running for look in running
+            _look(look.run_status.run, look.run_status.ledger, manifest, look.files).running for look in running
         )
 
     def look(self) -> Manifest:
@@ -219,7 +219,7 @@ class GridMirror:
         # It ended, or has not got, before the first row: what is known comes from the grid.
         status = Status(
             "running" if look.running else "failed", str(run.cell.config["name"]), run.seed, 0, run.cell.budget_steps,
-            0, look.started_at, look.ended_at, message=look.standing.detail or None,
+            0, look.started_at, look.ended_at, message=look.run_status.detail or None,
         )  # fmt: skip
         config = {key: value for key, value in run.cell.config.items() if key != "instances"}
         note = f"**{run.cell.label}**, seed {run.seed}: nothing trained yet\n\n{part.remark}"
@@ -227,7 +227,7 @@ class GridMirror:
 
     def _part(self, manifest: Manifest, run: Run, grid_key: str, parent_id: str) -> Part:
         look, cell = self._looks[run.key], run.cell
-        standing, code = look.standing, (look.status.fingerprint.get("code") if look.status is not None else None)
+        run_status, code = look.run_status, (look.status.fingerprint.get("code") if look.status is not None else None)
         # The commit is that of the code that froze the grid: it says nothing of a run by other code.
         git = manifest.git if code in (None, manifest.code) else {}
         tags = {
@@ -237,10 +237,10 @@ class GridMirror:
             "space_dist.cell": cell.id,
             "space_dist.cell_label": cell.label,
             "space_dist.curriculum": str(cell.config["curriculum"]["kind"]),
-            "space_dist.attempts": str(standing.attempts),
-            "space_dist.condition": standing.condition,
-            "space_dist.cause": standing.cause or NONE,
-            "space_dist.detail": standing.detail or NONE,
+            "space_dist.attempts": str(run_status.attempts),
+            "space_dist.condition": run_status.condition,
+            "space_dist.cause": run_status.cause or NONE,
+            "space_dist.detail": run_status.detail or NONE,
             "space_dist.job": str(look.history.where.get("job") or NONE),
             "space_dist.code": code or NONE,
             "space_dist.git_commit": git.get("git_commit", NONE),
@@ -258,7 +258,7 @@ class GridMirror:
 
     def _parent(self, manifest: Manifest, key: str) -> Parent:
         looks = [self._looks[run.key] for run, *_ in self._runs]
-        counts = Counter(look.standing.condition for look in looks)
+        counts = Counter(look.run_status.condition for look in looks)
         ending = "FAILED" if counts["failed"] else "FINISHED"
         if counts["running"] or counts["waiting"]:
             ending = "RUNNING"
@@ -299,22 +299,22 @@ def _signature(path: str) -> _Signature:
 
 def _look(run: Run, ledger: Ledger, manifest: Manifest, files: tuple[_Signature, ...]) -> Look:
     if not any(files):
-        waiting = Standing(run, ledger, "waiting", 0, run.cell.budget_steps, 0)
+        waiting = RunStatus(run, ledger, "waiting", 0, run.cell.budget_steps, 0)
         return Look(files, waiting, None, History(), 0.0, None)
     try:
         attempts = Attempts(ledger)
         rows, history = attempts.rows(), attempts.history()
         signed_at = max((float(row["unix_time"]) for row in rows), default=0.0)
-        standing = standing_of(run, ledger, manifest.retry, code_digest())
+        run_status = run_status_of(run, ledger, manifest.retry, code_digest())
         status = ledger.status() if files[0] else None
-        final = final_return(ledger, status) if status is not None and standing.condition == "done" else None
+        final = final_return(ledger, status) if status is not None and run_status.condition == "done" else None
     except LedgerError as error:
         ended = why_ended(Evidence(damage=str(error)))
-        standing = Standing(run, ledger, "failed", 0, run.cell.budget_steps, 0, ended.cause, ended.detail)
-        return Look(files, standing, None, History(), 0.0, None, fault=str(error))
+        run_status = RunStatus(run, ledger, "failed", 0, run.cell.budget_steps, 0, ended.cause, ended.detail)
+        return Look(files, run_status, None, History(), 0.0, None, fault=str(error))
     # A heartbeat is no news.
     history = dataclasses.replace(history, where={k: v for k, v in history.where.items() if k != "heartbeat"})
-    return Look(files, standing, status, history, signed_at, final)
+    return Look(files, run_status, status, history, signed_at, final)
 
 
 def final_return(ledger: Ledger, status: Status) -> float | None:
@@ -366,12 +366,12 @@ def describe(grid: Grid, manifest: Manifest, looks: Sequence[Look]) -> tuple[str
     looks: in the order of `manifest.runs()`.
     """
     plan = _plan(grid, manifest)
-    standing = _standing(looks)
+    status_lines = _status_lines(looks)
     head, *rows = _results(manifest, looks)
-    whole = "\n".join([*plan, "", *standing, "", head, *rows])
+    whole = "\n".join([*plan, "", *status_lines, "", head, *rows])
     if len(whole) <= MAX_TAG:
         return whole, None
-    shown, kept = [*plan, "", *standing, "", head], 0
+    shown, kept = [*plan, "", *status_lines, "", head], 0
     room = MAX_TAG - 100 - len("\n".join(shown))
     for row in rows:
         room -= len(row) + 1
@@ -416,14 +416,14 @@ def _plan(grid: Grid, manifest: Manifest) -> list[str]:
     ]
 
 
-def _standing(looks: Sequence[Look]) -> list[str]:
-    counts = Counter(look.standing.condition for look in looks)
-    failed = [look.standing for look in looks if look.standing.condition == "failed"]
+def _status_lines(looks: Sequence[Look]) -> list[str]:
+    counts = Counter(look.run_status.condition for look in looks)
+    failed = [look.run_status for look in looks if look.run_status.condition == "failed"]
     words = [f"{counts[name]} {name}" for name in _CONDITIONS if counts[name] and name != "failed"]
     words += [f"{len(failed)} failed ({_by_cause(failed)})"] if failed else []
     lines = [f"**{len(looks)} runs**: {', '.join(words)}"]
-    if any(look.standing.other_code for look in looks):
-        count = sum(look.standing.other_code for look in looks)
+    if any(look.run_status.other_code for look in looks):
+        count = sum(look.run_status.other_code for look in looks)
         lines += ["", f"{count} of the done were computed by another version of this package than this table."]
     if failed:
         lines.append("")
@@ -441,27 +441,27 @@ def _results(manifest: Manifest, looks: Sequence[Look]) -> list[str]:
 
     by_cell: dict[str, list[Look]] = {cell.id: [] for cell in manifest.cells}
     for look in looks:
-        by_cell[look.standing.run.cell.id].append(look)
+        by_cell[look.run_status.run.cell.id].append(look)
     rows = [
         "Final return on the test instances, over the seeds that are done:\n\n"
         "| cell | id | IQM | mean | least | greatest | seeds done | failed |\n|---|---|---:|---:|---:|---:|---:|---|"
     ]
     for cell in manifest.cells:
         members = by_cell[cell.id]
-        done = [look for look in members if look.standing.condition == "done"]
+        done = [look for look in members if look.run_status.condition == "done"]
         finals = np.array([math.nan if look.final is None else look.final for look in done], dtype=np.float64)
         numbers = ["—"] * 4
         if len(finals):
             numbers = [f"{x:.4g}" for x in (interquartile_mean(finals), finals.mean(), finals.min(), finals.max())]
         name = _cell_text(cell.label) + (" (baseline)" if cell.id == manifest.baseline else "")
-        failed = [look.standing for look in members if look.standing.condition == "failed"]
+        failed = [look.run_status for look in members if look.run_status.condition == "failed"]
         rows.append(
             f"| {name} | `{cell.id}` | {' | '.join(numbers)} | {len(done)}/{len(members)} | {_by_cause(failed)} |"
         )
     return rows
 
 
-def _by_cause(failed: Sequence[Standing]) -> str:
+def _by_cause(failed: Sequence[RunStatus]) -> str:
     causes = Counter(one.cause.in_words if one.cause else "unknown" for one in failed)
     return ", ".join(f"{count} {cause}" for cause, count in causes.most_common())
 
@@ -483,7 +483,7 @@ def _cell_text(text: str) -> str:
 
 def _remark(look: Look) -> str:
     """Where a run stands in its grid, and what is known of the end of its last attempt."""
-    one = look.standing
+    one = look.run_status
     lines = [f"In its grid: {one.in_words}, after {_count(one.attempts, 'attempt')}"]
     if one.detail:
         lines += ["", *(f"    {line}" for line in one.detail[:2000].splitlines())]

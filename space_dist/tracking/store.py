@@ -128,7 +128,7 @@ class Store:
             run, created = self._find_or_create(snapshot, self._experiment_id(experiment), run_id, known_new)
             self._push_params(run, snapshot)
             pushed = self._push_rows(run, snapshot)
-            self._push_standing(run, snapshot)
+            self._push_status(run, snapshot)
             if snapshot.started:
                 self._push_artifacts(run, snapshot)
             if snapshot.part is not None and run.data.tags.get(STAMP_TAG) != snapshot.part.stamp:
@@ -287,7 +287,7 @@ class Store:
             self._client.log_artifact(run.info.run_id, str(file))
         self._client.set_tag(run.info.run_id, ARTIFACTS_TAG, wanted)
 
-    def _push_standing(self, run: MlflowRun, snapshot: Snapshot) -> None:
+    def _push_status(self, run: MlflowRun, snapshot: Snapshot) -> None:
         """Tags and status, after the rows: nothing may look finished before its numbers are there."""
         from mlflow.entities import RunTag
 

@@ -14,7 +14,7 @@ from space_dist import config as configs
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import Ledger
 from space_dist.report import load_run
-from space_dist.report.load import standing
+from space_dist.report.load import state_in_words
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests import prepared
@@ -105,7 +105,7 @@ def test_an_exit_from_c_leaves_a_run_that_is_seen_to_be_abandoned(unharmed: dict
     assert train(tmp_path, "exit from C").returncode == 0  # nothing of Python's is asked
     ledger = Ledger(tmp_path / "run")
     assert ledger.abandoned(ledger.status())
-    assert "left behind by a process that is gone" in standing(load_run(ledger))
+    assert "left behind by a process that is gone" in state_in_words(load_run(ledger))
     said = forked(tmp_path, "evaluate", ledger.folder, "--json", "--instances", tmp_path / "test.csv")[1]
     assert '"state": "abandoned"' in said
     assert resume(tmp_path, "exit from C")[0] == 0

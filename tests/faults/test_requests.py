@@ -50,12 +50,12 @@ def test_handlers_stand_while_something_would_replace_them() -> None:
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     stop = StopRequests()
     try:
-        with stop.standing():  # none were set
+        with stop.keeping_handlers():  # none were set
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
         assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
         stop.install()
         ours = signal.getsignal(signal.SIGTERM)
-        with stop.standing():
+        with stop.keeping_handlers():
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             assert signal.getsignal(signal.SIGTERM) == ours
             signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # none of ours
