@@ -609,7 +609,7 @@ def test_a_done_run_whose_supervisor_died_before_it_said_so_has_its_end_written_
     attempts = Attempts(grid.ledger(run))
     begin, process, _ = attempts.path.read_bytes().splitlines(keepends=True)
     attempts.path.write_bytes(begin + process)
-    assert not run_status_of(run, grid.ledger(run), manifest.retry, CODE).told
+    assert not run_status_of(run, grid.ledger(run), manifest.retry, CODE).end_recorded
 
     def conduct() -> Script:
         script = Script(grid, {})

@@ -180,7 +180,7 @@ def learnt_from_samples(algorithm: Any, random: np.random.Generator) -> bytes:
     samples = [observed, following, actions, rewards, factors]
     if algorithm == "dqn":
         samples[2] = random.integers(0, 3, size=(150, 1)).astype("f4")
-    told, adam = np.zeros((3, {"dqn": dqn, "td3": td3, "sac": sac}[algorithm].TOLD)), (1e-3, 0.9, 0.999, 1e-8)
+    told, adam = np.zeros((3, {"dqn": dqn, "td3": td3, "sac": sac}[algorithm].N_RECORDED)), (1e-3, 0.9, 0.999, 1e-8)
     arguments: tuple[Any, ...] = m, layout.plan, layout.layers
     if algorithm == "dqn":
         dqn.prepare(np.dtype("f4"))(*arguments, dqn.Settings(*adam, 0, 10.0), *samples, 50, told)
@@ -209,7 +209,7 @@ def test_what_optimisers_remember_of_dead_units_vanishes_at_once() -> None:
     weights, biases = (layout.places[f"q_net.q_net.0.{name}"] for name in ("weight", "bias"))
     m[weights], m[biases] = random.normal(size=(2, 280))[0], -100.0  # nothing is ever active
     m[2 * length + weights], m[3 * length + weights] = 1e-37, 2e-38
-    before, told = m[weights].copy(), np.zeros((60, dqn.TOLD))
+    before, told = m[weights].copy(), np.zeros((60, dqn.N_RECORDED))
     samples = [random.normal(size=(60 * 16, columns)).astype("f4") for columns in (7, 7, 1, 1, 1)]
     samples[2] = random.integers(0, 3, size=(60 * 16, 1)).astype("f4")
     settings = dqn.Settings(1e-3, 0.9, 0.99, 1e-8, 1000, 10.0)

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
 from space_dist.kernels.lanes import product
-from space_dist.kernels.ppo import TOLD
+from space_dist.kernels.ppo import N_RECORDED
 from space_dist.learner.stack import Stack
 from space_dist.learner.stacked import PPO, PPOSettings, Samples
 
@@ -98,7 +98,7 @@ def _compiled(shape: Shape, size: int) -> Callable[[], object]:
     samples[:, : layout.record_at + layout.plan.fields] = random.normal(size=(n, layout.record_at + layout.plan.fields))
     samples[:, shape.inputs : layout.record_at] = 0.0
     settings = Settings(3e-4, 0.9, 0.999, 1e-5, 0, 0.2, math.inf, 0.0, 0.5, 0.5, math.inf, True)
-    orders, told, flat = random.permutation(n)[None], np.zeros((MINIBATCHES, TOLD)), samples.ravel()
+    orders, told, flat = random.permutation(n)[None], np.zeros((MINIBATCHES, N_RECORDED)), samples.ravel()
     return lambda: update(m, layout.plan, layout.layers, settings, flat, orders, size, told)
 
 

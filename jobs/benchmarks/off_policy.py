@@ -19,7 +19,7 @@ from stable_baselines3 import DQN, SAC, TD3
 
 from space_dist import config as configs
 from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
-from space_dist.kernels.ppo import TOLD
+from space_dist.kernels.ppo import N_RECORDED
 from space_dist.learner.lean_replay import LEAN
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
@@ -142,7 +142,7 @@ def _rate() -> float:
     samples[:, :6] = random.normal(size=(SAMPLES, 6))
     fields = samples[:, layout.record_at : layout.record_at + layout.plan.fields]
     fields[:] = random.normal(size=fields.shape)
-    orders, told = random.permutation(SAMPLES)[None], np.zeros((SAMPLES // SIZE, TOLD))
+    orders, told = random.permutation(SAMPLES)[None], np.zeros((SAMPLES // SIZE, N_RECORDED))
     settings = Settings(1e-5, 0.9, 0.999, 1e-5, 0, 0.2, np.inf, 0.0, 0.5, 0.5, np.inf, True)
     update, times = prepare(dtype).update, []
     for _ in range(10):

@@ -436,11 +436,11 @@ def _display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], N
         with Live(console=console, refresh_per_second=4, transient=True) as live:
             yield lambda overview: live.update(_live_table(manifest, place, overview))
         return
-    told_at = 0.0
-    told: tuple[object, ...] = ()
+    logged_at = 0.0
+    logged: tuple[object, ...] = ()
 
     def observe(overview: Overview) -> None:
-        nonlocal told_at, told
+        nonlocal logged_at, logged
         line = (
             f"{manifest.name}: {overview.done} of {overview.total} done, {len(overview.running)} running, "
             f"{overview.waiting} waiting, {overview.failed} failed"
@@ -448,8 +448,8 @@ def _display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], N
         if overview.message:
             line += f" (last: {overview.message})"
         news = (overview.done, overview.failed, overview.message)
-        if time.monotonic() - told_at > _LOG_SECONDS or news != told:
-            told_at, told = time.monotonic(), news
+        if time.monotonic() - logged_at > _LOG_SECONDS or news != logged:
+            logged_at, logged = time.monotonic(), news
             say(line)
 
     yield observe

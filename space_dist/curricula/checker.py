@@ -59,7 +59,7 @@ class _FaultError(Exception):
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Iteration:
     """One iteration, made up. flavour: what is uncommon about it, in words that follow a verb; often nothing."""
 
     episodes: Episodes
@@ -119,16 +119,16 @@ class _Check:
         selections, values = [selection], generator(_SEED, Purpose.EPISODES).normal(size=len(self._instances))
         for decision in range(1, DECISIONS + 1):
             restored = self._check_stored(state, selection)
-            told = self._told(decision, selection, values)
-            feedback = self._feedback(used, state, told, values)
-            answer = self._check_decision(used, (state, restored), feedback, decision, told.flavour)
+            iteration = self._iteration(decision, selection, values)
+            feedback = self._feedback(used, state, iteration, values)
+            answer = self._check_decision(used, (state, restored), feedback, decision, iteration.flavour)
             same = _difference(answer[1].ids, selection.ids) is None
             if answer[1].order_version == selection.order_version and not same:
                 raise _FaultError(
                     "step() selects other instances under the same order_version, and the walk over the old ones would "
                     "go on; set order_version to the version at which ids last changed"
                 )
-            (state, selection, _), values = answer, told.values
+            (state, selection, _), values = answer, iteration.values
             selections.append(selection)
         self._check_stored(state, selection)
         return selections
@@ -212,10 +212,12 @@ class _Check:
         values = np.zeros(len(self._instances))
         try:
             for decision in range(1, DECISIONS + 1):
-                told = self._told(decision, selection, values)
-                episodes = dataclasses.replace(told.episodes, success=np.full(len(told.episodes.success), np.nan))
-                feedback = self._feedback(used, state, dataclasses.replace(told, episodes=episodes), values)
-                (state, selection, _), values = used.step(state, feedback), told.values
+                iteration = self._iteration(decision, selection, values)
+                episodes = dataclasses.replace(
+                    iteration.episodes, success=np.full(len(iteration.episodes.success), np.nan)
+                )
+                feedback = self._feedback(used, state, dataclasses.replace(iteration, episodes=episodes), values)
+                (state, selection, _), values = used.step(state, feedback), iteration.values
         except Exception as error:  # somebody else's code may raise anything
             text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {error}"
             self._findings.notes.append(
@@ -234,7 +236,7 @@ class _Check:
         except ConfigError as error:
             raise _FaultError(str(error)) from None
 
-    def _told(self, decision: int, selection: Selection, before: FloatArray) -> _Told:
+    def _iteration(self, decision: int, selection: Selection, before: FloatArray) -> _Iteration:
         """One iteration: seeded, and by turns without an episode that ended, and without a gradient step."""
         random = generator(_SEED, Purpose.EPISODES, decision)
         idle, empty = decision % 7 == 3, decision % 5 == 2
@@ -252,12 +254,12 @@ class _Check:
         )  # fmt: skip
         values = before if idle else 0.9 * before + 0.3 * random.normal(size=len(before))
         flavour = " where no episode ended" if empty else " where no gradient step was made" if idle else ""
-        return _Told(episodes, values, 0 if idle else 10, flavour)
+        return _Iteration(episodes, values, 0 if idle else 10, flavour)
 
-    def _feedback(self, used: Custom, state: State, told: _Told, before: FloatArray) -> Feedback:
-        episodes = told.episodes if self._wants.episodes else None
+    def _feedback(self, used: Custom, state: State, iteration: _Iteration, before: FloatArray) -> Feedback:
+        episodes = iteration.episodes if self._wants.episodes else None
         return Feedback(
-            version=state.version, values_before=before, values_after=told.values, gradient_steps=told.gradient_steps,
+            version=state.version, values_before=before, values_after=iteration.values, gradient_steps=iteration.gradient_steps,
             episodes=episodes, probes=self._probed(used, state, episodes) if self._wants.probes else None,
         )  # fmt: skip
 

@@ -198,9 +198,9 @@ class BatchedBullet(Generic[Episode]):
         terminated, success = np.zeros((2, self.n_slots), dtype=np.bool_)
         for slot in range(self.n_slots):
             world = self._at_home(slot)
-            told = world.act(self._episodes[slot], chosen[slot])
+            outcome = world.act(self._episodes[slot], chosen[slot])
             self._time[slot] += 1  # from now on the episode cannot simply be begun again
-            observations[slot], rewards[slot], terminated[slot], success[slot] = told
+            observations[slot], rewards[slot], terminated[slot], success[slot] = outcome
         truncated = (self._time >= self.horizon) & ~terminated
         return Step(observations, rewards, terminated, truncated, success if self.knows_success else None)
 

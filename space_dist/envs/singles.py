@@ -82,7 +82,7 @@ class BatchedSingles:
         n = self.n_slots
         rewards, success = np.empty(n), np.zeros(n, dtype=np.bool_)
         terminated, truncated = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-        told = False
+        known = False
         self._time += 1
         for slot in range(n):
             action = int(actions[slot]) if actions.ndim == 1 else np.array(actions[slot])
@@ -92,12 +92,12 @@ class BatchedSingles:
             terminated[slot] = ended
             truncated[slot] = (cut or self._time[slot] >= self.horizon) and not ended
             found = [info[key] for key in SUCCESS_KEYS if key in info]
-            told |= bool(found)
+            known |= bool(found)
             success[slot] = bool(found and found[0])
             if terminated[slot] or truncated[slot]:
                 self._refuse_other_manners(bool(found))
         observations = take(self._observations, slice(None))
-        return Step(observations, rewards, terminated, truncated, success if told else None)
+        return Step(observations, rewards, terminated, truncated, success if known else None)
 
     def frame(self, slot: int) -> NDArray[np.uint8]:
         """What the slot's own `render` draws. Raises ConfigError if that is no picture."""

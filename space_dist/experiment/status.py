@@ -152,7 +152,7 @@ class RunStatus:
     condition: `waiting` runs will be started, or go on, when somebody works on the grid; `failed` ones will not.
     cause, detail: of the last attempt's end, if it has not been done since.
     steps, budget_steps: environment steps. attempts: how many began. other_code: done, but by another version of this
-    package than the one here. told, supervised: of a run that is done, whether the end of its last attempt is written,
+    package than the one here. end_recorded, supervised: of a run that is done, whether the end of its last attempt is written,
     and whether its supervisor lives that would write it.
     """
 
@@ -166,7 +166,7 @@ class RunStatus:
     detail: str = ""
     other_code: bool = False
     fingerprint_changed: bool = False
-    told: bool = True
+    end_recorded: bool = True
     supervised: bool = False
 
     @property
@@ -191,7 +191,7 @@ def run_status_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> RunStatu
         return RunStatus(
             run, ledger, "done", steps, budget, history.begun,
             other_code=status.fingerprint.get("code") != code, fingerprint_changed=status.fingerprint_changed,
-            told=history.last is not None or not history.begun, supervised=believed_alive(history.where),
+            end_recorded=history.last is not None or not history.begun, supervised=believed_alive(history.where),
         )  # fmt: skip
     if status is not None and ledger.owner_alive():
         return RunStatus(run, ledger, "running", steps, budget, history.begun)

@@ -187,10 +187,10 @@ class Conductor:
         elif run_status.condition == "failed":
             self._overview.failed += 1
             log.warning("%s: %s: %s", run.title, run_status.in_words, run_status.detail)
-        elif not run_status.told and run_status.supervised:
+        elif not run_status.end_recorded and run_status.supervised:
             self._elsewhere[run.key] = run
         else:
-            if not run_status.told:  # its supervisor died in between
+            if not run_status.end_recorded:  # its supervisor died in between
                 concluded(run_status.ledger, run_status.attempts)
             self._overview.done += 1
 
@@ -315,16 +315,16 @@ def working_on(
 def _acquired(
     grid: Grid, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
 ) -> Lock:  # fmt: skip
-    lock, told = Lock(grid.lock_file), False
+    lock, said = Lock(grid.lock_file), False
     while True:
         try:
             lock.acquire()
         except RunLockedError as error:
             if not wait:
                 raise
-            if not told:
+            if not said:
                 say(f"{error}. This process takes over then.")
-                told = True
+                said = True
             if reason := stop_requested():
                 raise Interrupted(f"stopped while waiting ({reason})") from None
             time.sleep(_ELSEWHERE_SECONDS)

@@ -428,8 +428,8 @@ def main() -> None:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
             ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.attempts)
-        told = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
-        print(json.dumps({"ends": told}), file=results, flush=True)
+        ends = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
+        print(json.dumps({"ends": ends}), file=results, flush=True)
 
 
 def preload() -> None:

@@ -23,7 +23,7 @@ from space_dist.kernels.replay import VALUES, columns, panels, prepared, set_goa
 
 # What a minibatch tells of itself: columns.
 LOSS, NORM = range(2)
-TOLD = 2
+N_RECORDED = 2
 
 
 class Settings(NamedTuple):
@@ -75,15 +75,15 @@ def _loss(m: Any, plan: Any, layers: Any) -> Any:
 @entry
 def update(
     m: Any, plan: Any, layers: Any, settings: Any, observations: Any, next_observations: Any, actions: Any,
-    rewards: Any, factors: Any, size: int, told: Any,
+    rewards: Any, factors: Any, size: int, recorded: Any,
 ) -> None:  # fmt: skip
     """Gradient steps on minibatches of `size`, one after the other's samples.
 
     m: the array of a `ReplayLayout`.  observations, next_observations: (n, inputs).  actions, rewards, factors (of what
-    the next observation promises): (n, 1).  told: (minibatches, TOLD) is filled.
+    the next observation promises): (n, 1).  recorded: (minibatches, N_RECORDED) is filled.
     """
     share_out(m, plan, size)
-    for step in range(len(told)):
+    for step in range(len(recorded)):
         first, rows = step * size, plan.rows
         columns(m, rows, plan.actions_at, actions, first, size)
         columns(m, rows, plan.rewards_at, rewards, first, size)
@@ -93,10 +93,10 @@ def update(
         _goals(m, plan, layers)
         panels(m, rows, plan.inputs_at, observations, first, size)
         forward(m, plan, layers, VALUES)
-        told[step, LOSS] = _loss(m, plan, layers)
+        recorded[step, LOSS] = _loss(m, plan, layers)
         backward(m, plan, layers, VALUES, size)
         length = norm(m, plan.length, 2 * plan.length)
-        told[step, NORM] = length
+        recorded[step, NORM] = length
         factor = clipping(settings.max_grad_norm, length)
         adam(m, plan.length, 0, plan.length, settings, settings.steps + step + 1, factor)
 
@@ -104,4 +104,4 @@ def update(
 @functools.cache
 def prepare(dtype: Any) -> Any:
     """`update`, compiled for arrays of `dtype`, which are the only ones it then takes."""
-    return prepared(update, dtype, "dqn", Settings(0.0, 0.0, 0.0, 0.0, 0, 0.0), 0, TOLD)
+    return prepared(update, dtype, "dqn", Settings(0.0, 0.0, 0.0, 0.0, 0, 0.0), 0, N_RECORDED)

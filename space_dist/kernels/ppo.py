@@ -29,7 +29,7 @@ from space_dist.kernels.optimiser import adam, clipping, norm
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 # What a minibatch tells of itself: columns.
 POLICY_LOSS, VALUE_LOSS, ENTROPY, DIVERGENCE, CLIPPED, NORM = range(6)
-TOLD = 6
+N_RECORDED = 6
 
 
 class Settings(NamedTuple):
@@ -147,8 +147,8 @@ def _categorical_backward(m: Any, plan: Any, layers: Any, row: int, by: Any, bon
 
 
 @function
-def _losses(m: Any, plan: Any, layers: Any, settings: Any, told: Any) -> None:
-    """Losses of a minibatch, into `told`, and the gradients of the networks' outputs."""
+def _losses(m: Any, plan: Any, layers: Any, settings: Any, recorded: Any) -> None:
+    """Losses of a minibatch, into `recorded`, and the gradients of the networks' outputs."""
     lanes, rows, fields = width(m), plan.rows, plan.fields_at + (plan.fields - 4) * plan.rows
     zero, one = every(m, 0.0), every(m, 1.0)
     low, high = every(m, 1.0 - settings.clip_range), every(m, 1.0 + settings.clip_range)
@@ -195,18 +195,18 @@ def _losses(m: Any, plan: Any, layers: Any, settings: Any, told: Any) -> None:
         errors = values - returns
         squares = fma(errors * errors, share, squares)
         store(m, by_values_at + row, errors * slope)
-    told[POLICY_LOSS], told[VALUE_LOSS], told[ENTROPY] = total(policy), total(squares), total(entropy)
-    told[DIVERGENCE], told[CLIPPED] = total(divergence), total(clips)
+    recorded[POLICY_LOSS], recorded[VALUE_LOSS], recorded[ENTROPY] = total(policy), total(squares), total(entropy)
+    recorded[DIVERGENCE], recorded[CLIPPED] = total(divergence), total(clips)
 
 
 @entry
 def update(
-    m: Any, plan: Any, layers: Any, settings: Any, samples: Any, orders: Any, size: int, told: Any
+    m: Any, plan: Any, layers: Any, settings: Any, samples: Any, orders: Any, size: int, recorded: Any
 ) -> tuple[int, int, int]:
     """All epochs and minibatches.
 
     m: the array of a `Layout`.  samples: (n * plan.record,).  orders: (epochs, n) permutations.  size: of minibatches.
-    told: (minibatches, TOLD) is filled.  Returns how many minibatches were computed, the last of which makes no step
+    recorded: (minibatches, N_RECORDED) is filled.  Returns how many minibatches were computed, the last of which makes no step
     where `target_kl` has stopped the update; how many steps were made; and how many epochs were begun.
     """
     n, done, steps = orders.shape[1], 0, 0
@@ -218,14 +218,14 @@ def update(
                 _normalize(m, plan, count)
             forward(m, plan, layers, ACTOR)
             forward(m, plan, layers, CRITIC)
-            _losses(m, plan, layers, settings, told[done])
+            _losses(m, plan, layers, settings, recorded[done])
             done += 1
-            if told[done - 1, DIVERGENCE] > 1.5 * settings.target_kl:
+            if recorded[done - 1, DIVERGENCE] > 1.5 * settings.target_kl:
                 return done, steps, epoch + 1
             backward(m, plan, layers, ACTOR, count)
             backward(m, plan, layers, CRITIC, count)
             length = norm(m, plan.length, 2 * plan.length)
-            told[done - 1, NORM] = length
+            recorded[done - 1, NORM] = length
             steps += 1
             factor = clipping(settings.max_grad_norm, length)
             adam(m, plan.length, 0, plan.length, settings, settings.steps + steps, factor)
@@ -295,14 +295,14 @@ def prepare(dtype: Any) -> Entries:
     """All entries, compiled for arrays of `dtype`, which are the only ones they then take."""
     layout = Layout.of(Shape(1, 1, False, (1,), "tanh"), 1, np.dtype(dtype).itemsize)
     m, row, rows = np.zeros(1, dtype), np.zeros(1, dtype), np.zeros((1, 1), dtype)
-    orders, told = np.zeros((1, 1), np.int64), np.zeros((1, TOLD))
+    orders, recorded = np.zeros((1, 1), np.int64), np.zeros((1, N_RECORDED))
     settings = Settings(0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
     entries, singles = Entries(update, evaluate, advantages), np.zeros((1, 1), np.float32)
     for one in entries:
         one.disable_compile(False)
     ready(
         [
-            (update, (m, layout.plan, layout.layers, settings, row, orders, 1, told)),
+            (update, (m, layout.plan, layout.layers, settings, row, orders, 1, recorded)),
             (evaluate, (m, layout.plan, layout.layers, row, orders[0], rows, row, row)),
             (advantages, (singles, singles, singles, row, singles[0], 0.0, 0.0, singles)),
         ]

@@ -161,9 +161,9 @@ def prepared(entry: Any, dtype: Any, algorithm: Algorithm, settings: Any, noises
     """
     layout = ReplayLayout.of(ReplayShape(algorithm, 1, 1, (1,), "relu"), 1, np.dtype(dtype).itemsize)
     samples: Sequence[Any] = [np.zeros((1, 1), dtype)] * (5 + noises)
-    told = np.zeros((1, columns))
+    recorded = np.zeros((1, columns))
     entry.disable_compile(False)
-    ready([(entry, (np.zeros(1, dtype), layout.plan, layout.layers, settings, *samples, 1, told))])
+    ready([(entry, (np.zeros(1, dtype), layout.plan, layout.layers, settings, *samples, 1, recorded))])
     entry.disable_compile()
     return entry
 

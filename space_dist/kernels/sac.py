@@ -31,7 +31,7 @@ _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 _LEAST, _MOST, _SPARE = -20.0, 2.0, 1e-6
 # What a minibatch tells of itself: columns.
 CRITIC_LOSS, ACTOR_LOSS, ENT_COEF, ENT_COEF_LOSS = range(4)
-TOLD = 4
+N_RECORDED = 4
 
 
 class Settings(NamedTuple):
@@ -147,21 +147,21 @@ def _improve(m: Any, plan: Any, layers: Any, alpha: Any, size: int) -> Any:
 @entry
 def update(
     m: Any, plan: Any, layers: Any, settings: Any, observations: Any, next_observations: Any, actions: Any,
-    rewards: Any, factors: Any, noise: Any, next_noise: Any, size: int, told: Any,
+    rewards: Any, factors: Any, noise: Any, next_noise: Any, size: int, recorded: Any,
 ) -> None:  # fmt: skip
     """Gradient steps on minibatches of `size`, one after the other's samples.
 
     m: the array of a `ReplayLayout`.  observations, next_observations: (n, inputs).  actions: (n, outputs).
     rewards, factors (of what the next observation promises): (n, 1).  noise, next_noise: (n, outputs) standard normal
-    numbers, of actions in both observations.  told: (minibatches, TOLD) is filled.
+    numbers, of actions in both observations.  recorded: (minibatches, N_RECORDED) is filled.
     """
     share_out(m, plan, size)
-    for step in range(len(told)):
+    for step in range(len(recorded)):
         first, rows, number = step * size, plan.rows, settings.steps + step + 1
         alpha = every(m, settings.ent_coef)
         if settings.learned:
             alpha = exp(every(m, m[plan.log_alpha_at]))
-        told[step, ENT_COEF] = total(alpha) / width(m)
+        recorded[step, ENT_COEF] = total(alpha) / width(m)
 
         columns(m, rows, plan.rewards_at, rewards, first, size)
         columns(m, rows, plan.factors_at, factors, first, size)
@@ -178,7 +178,7 @@ def update(
         columns(m, rows, plan.actions_at, actions, first, size)
         panels(m, rows, plan.joint_at, observations, first, size)
         join(m, plan, size)
-        told[step, CRITIC_LOSS] = fit_critics(m, plan, layers, 0.5, size)
+        recorded[step, CRITIC_LOSS] = fit_critics(m, plan, layers, 0.5, size)
         adam(m, plan.length, plan.critics_at, plan.log_alpha_at, settings, number, 1.0)
 
         columns(m, rows, plan.noise_at, noise, first, size)
@@ -187,11 +187,11 @@ def update(
         _sample(m, plan, layers)
         if settings.learned:
             excess = _excess(m, plan, settings.target_entropy)
-            told[step, ENT_COEF_LOSS] = -m[plan.log_alpha_at] * excess
+            recorded[step, ENT_COEF_LOSS] = -m[plan.log_alpha_at] * excess
             m[plan.length + plan.log_alpha_at] = -excess
             adam(m, plan.length, plan.log_alpha_at, plan.log_alpha_at + width(m), settings, number, 1.0)
         join(m, plan, size)
-        told[step, ACTOR_LOSS] = _improve(m, plan, layers, alpha, size)
+        recorded[step, ACTOR_LOSS] = _improve(m, plan, layers, alpha, size)
         adam(m, plan.length, 0, plan.critics_at, settings, number, 1.0)
         if (settings.made + step) % settings.target_update_interval == 0:
             follow(m, plan.targets, plan.critics_at, plan.log_alpha_at, settings.tau)
@@ -201,4 +201,4 @@ def update(
 def prepare(dtype: Any) -> Any:
     """`update`, compiled for arrays of `dtype`, which are the only ones it then takes."""
     settings = Settings(0.0, 0.0, 0.0, 0.0, 0, 0, 1, 0.0, False, 0.0, 0.0)
-    return prepared(update, dtype, "sac", settings, 2, TOLD)
+    return prepared(update, dtype, "sac", settings, 2, N_RECORDED)

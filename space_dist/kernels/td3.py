@@ -27,7 +27,7 @@ from space_dist.kernels.replay import (
 
 # What a minibatch tells of itself: columns. The actor's loss where it makes a step.
 CRITIC_LOSS, ACTOR_LOSS = range(2)
-TOLD = 2
+N_RECORDED = 2
 
 
 class Settings(NamedTuple):
@@ -99,17 +99,17 @@ def _improve(m: Any, plan: Any, layers: Any, size: int) -> Any:
 @entry
 def update(
     m: Any, plan: Any, layers: Any, settings: Any, observations: Any, next_observations: Any, actions: Any,
-    rewards: Any, factors: Any, noise: Any, size: int, told: Any,
+    rewards: Any, factors: Any, noise: Any, size: int, recorded: Any,
 ) -> int:  # fmt: skip
     """Gradient steps on minibatches of `size`, one after the other's samples.
 
     m: the array of a `ReplayLayout`.  observations, next_observations: (n, inputs).  actions: (n, outputs).
     rewards, factors (of what the next observation promises): (n, 1).  noise: (n, outputs) on target actions.
-    told: (minibatches, TOLD) is filled.  Returns how many steps the actor has made.
+    recorded: (minibatches, N_RECORDED) is filled.  Returns how many steps the actor has made.
     """
     share_out(m, plan, size)
     made = 0
-    for step in range(len(told)):
+    for step in range(len(recorded)):
         first, rows = step * size, plan.rows
         columns(m, rows, plan.rewards_at, rewards, first, size)
         columns(m, rows, plan.factors_at, factors, first, size)
@@ -126,13 +126,13 @@ def update(
         columns(m, rows, plan.actions_at, actions, first, size)
         panels(m, rows, plan.joint_at, observations, first, size)
         join(m, plan, size)
-        told[step, CRITIC_LOSS] = fit_critics(m, plan, layers, 1.0, size)
+        recorded[step, CRITIC_LOSS] = fit_critics(m, plan, layers, 1.0, size)
         critic_step = settings.critic_steps + step + 1
         adam(m, plan.length, plan.critics_at, plan.log_alpha_at, settings, critic_step, 1.0)
 
         if (settings.updates + step + 1) % settings.policy_delay == 0:
             panels(m, rows, plan.inputs_at, observations, first, size)
-            told[step, ACTOR_LOSS] = _improve(m, plan, layers, size)
+            recorded[step, ACTOR_LOSS] = _improve(m, plan, layers, size)
             made += 1
             adam(m, plan.length, 0, plan.critics_at, settings, settings.actor_steps + made, 1.0)
             follow(m, plan.targets, 0, plan.log_alpha_at, settings.tau)
@@ -142,4 +142,4 @@ def update(
 @functools.cache
 def prepare(dtype: Any) -> Any:
     """`update`, compiled for arrays of `dtype`, which are the only ones it then takes."""
-    return prepared(update, dtype, "td3", Settings(0.0, 0.0, 0.0, 0.0, 0, 0, 0, 1, 0.0), 1, TOLD)
+    return prepared(update, dtype, "td3", Settings(0.0, 0.0, 0.0, 0.0, 0, 0, 0, 1, 0.0), 1, N_RECORDED)

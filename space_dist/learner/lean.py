@@ -23,7 +23,7 @@ from stable_baselines3.common.utils import explained_variance
 from torch import nn
 
 from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
-from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, ENTROPY, POLICY_LOSS, TOLD, VALUE_LOSS
+from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, ENTROPY, N_RECORDED, POLICY_LOSS, VALUE_LOSS
 
 Array = NDArray[np.floating[Any]]
 _ROWS = 64  # samples that are evaluated together; no result depends on it
@@ -90,14 +90,14 @@ class LeanPPO(PPO):
 
     def _metrics(self, report: Report) -> dict[str, float]:
         """What `PPO.train` records: means over minibatches, of the divergence those of the last epoch."""
-        told, buffer, settings = report.told, self.rollout_buffer, self._settings()
-        last = told[-1]
+        recorded, buffer, settings = report.recorded, self.rollout_buffer, self._settings()
+        last = recorded[-1]
         metrics = {
-            "entropy_loss": -told[:, ENTROPY].mean(),
-            "policy_gradient_loss": told[:, POLICY_LOSS].mean(),
-            "value_loss": told[:, VALUE_LOSS].mean(),
-            "approx_kl": told[report.last_epoch :, DIVERGENCE].mean(),
-            "clip_fraction": told[:, CLIPPED].mean(),
+            "entropy_loss": -recorded[:, ENTROPY].mean(),
+            "policy_gradient_loss": recorded[:, POLICY_LOSS].mean(),
+            "value_loss": recorded[:, VALUE_LOSS].mean(),
+            "approx_kl": recorded[report.last_epoch :, DIVERGENCE].mean(),
+            "clip_fraction": recorded[:, CLIPPED].mean(),
             "loss": last[POLICY_LOSS] - self.ent_coef * last[ENTROPY] + self.vf_coef * last[VALUE_LOSS],
             "explained_variance": explained_variance(buffer.values.flatten(), buffer.returns.flatten()),
         }
@@ -113,11 +113,11 @@ class LeanPPO(PPO):
 class Report:
     """What an update says of itself.
 
-    told: (minibatches, kernels.ppo.TOLD), the last of which `target_kl` may have refused.
+    recorded: (minibatches, kernels.ppo.N_RECORDED), the last of which `target_kl` may have refused.
     last_epoch: the first minibatch of the last one.
     """
 
-    told: NDArray[np.float64]
+    recorded: NDArray[np.float64]
     epochs: int
     last_epoch: int
 
@@ -158,12 +158,12 @@ class Network:
         if state:
             for part, moment in ((parts[2], "exp_avg"), (parts[3], "exp_avg_sq")):
                 part[places] = joined([state[parameter][moment] for parameter in self._parameters])
-        told = np.zeros((len(orders) * -(-n // size), TOLD))
+        recorded = np.zeros((len(orders) * -(-n // size), N_RECORDED))
         done, made, epochs = prepare(self._dtype).update(
-            m, layout.plan, layout.layers, settings._replace(steps=steps), samples.ravel(), orders, size, told
+            m, layout.plan, layout.layers, settings._replace(steps=steps), samples.ravel(), orders, size, recorded
         )
         self._keep(layout, parts, steps + made)
-        return Report(told[:done], epochs, (epochs - 1) * -(-n // size))
+        return Report(recorded[:done], epochs, (epochs - 1) * -(-n // size))
 
     def _keep(self, layout: Layout, parts: Array, steps: int) -> None:
         """Give policy and optimiser their numbers."""

@@ -149,19 +149,19 @@ class LeanDQN(DQN):
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Learn from the replay buffer as `DQN.train` does, and record the same metrics."""
         self._update_learning_rate(self.policy.optimizer)
-        networks, told = self.networks, []
+        networks, recorded = self.networks, []
         m, layout, (steps,) = networks.laid_out(batch_size), networks.layout(batch_size), networks.steps()
         settings = dqn.Settings(
             **_adam(self.policy.optimizer), steps=steps, max_grad_norm=float(self.max_grad_norm)
         )  # fmt: skip
         for count, samples, _ in _batches(self, networks.dtype, gradient_steps, batch_size):
-            told.append(np.zeros((count, dqn.TOLD)))
-            dqn.prepare(networks.dtype)(m, layout.plan, layout.layers, settings, *samples, batch_size, told[-1])
+            recorded.append(np.zeros((count, dqn.N_RECORDED)))
+            dqn.prepare(networks.dtype)(m, layout.plan, layout.layers, settings, *samples, batch_size, recorded[-1])
             settings = settings._replace(steps=settings.steps + count)
         networks.keep(m, batch_size, [settings.steps])
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/loss", np.concatenate(told)[:, dqn.LOSS].mean())
+        self.logger.record("train/loss", np.concatenate(recorded)[:, dqn.LOSS].mean())
 
 
 class LeanTD3(TD3):
@@ -175,7 +175,7 @@ class LeanTD3(TD3):
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Learn from the replay buffer as `TD3.train` does, and record the same metrics."""
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        networks, told = self.networks, []
+        networks, recorded = self.networks, []
         m, layout, (of_actor, of_critics) = networks.laid_out(batch_size), networks.layout(batch_size), networks.steps()
         settings = td3.Settings(
             **_adam(self.critic.optimizer), critic_steps=of_critics, actor_steps=of_actor, updates=self._n_updates,
@@ -186,10 +186,10 @@ class LeanTD3(TD3):
             for one in noise:  # a draw for all steps would be another one
                 one.normal_(0, self.target_policy_noise)
             noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
-            told.append(np.zeros((count, td3.TOLD)))
+            recorded.append(np.zeros((count, td3.N_RECORDED)))
             made = td3.prepare(networks.dtype)(
                 m, layout.plan, layout.layers, settings, *samples,
-                noise.view(-1, networks.shape.outputs).numpy().astype(networks.dtype), batch_size, told[-1],
+                noise.view(-1, networks.shape.outputs).numpy().astype(networks.dtype), batch_size, recorded[-1],
             )  # fmt: skip
             settings = settings._replace(
                 critic_steps=settings.critic_steps + count, actor_steps=settings.actor_steps + made,
@@ -198,7 +198,7 @@ class LeanTD3(TD3):
         networks.keep(m, batch_size, [settings.actor_steps, settings.critic_steps])
         numbers = np.arange(self._n_updates + 1, self._n_updates + gradient_steps + 1)
         self._n_updates += gradient_steps
-        losses, acted = np.concatenate(told), numbers % self.policy_delay == 0
+        losses, acted = np.concatenate(recorded), numbers % self.policy_delay == 0
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if acted.any():
             self.logger.record("train/actor_loss", losses[acted, td3.ACTOR_LOSS].mean())
@@ -220,7 +220,7 @@ class LeanSAC(SAC):
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Learn from the replay buffer as `SAC.train` does, and record the same metrics."""
         self._update_learning_rate(self._all_optimizers())
-        networks, told, learned = self.networks, [], self.ent_coef_optimizer is not None
+        networks, recorded, learned = self.networks, [], self.ent_coef_optimizer is not None
         m, layout, steps = networks.laid_out(batch_size), networks.layout(batch_size), networks.steps()
         settings = sac.Settings(
             **_adam(self.critic.optimizer), steps=steps[0], made=0,
@@ -233,15 +233,15 @@ class LeanSAC(SAC):
             for now, then in zip(*noise, strict=True):  # a draw for all steps would be another one
                 now.normal_()
                 then.normal_()
-            told.append(np.zeros((count, sac.TOLD)))
+            recorded.append(np.zeros((count, sac.N_RECORDED)))
             sac.prepare(networks.dtype)(
                 m, layout.plan, layout.layers, settings, *samples,
-                *(one.view(-1, networks.shape.outputs).numpy() for one in noise), batch_size, told[-1],
+                *(one.view(-1, networks.shape.outputs).numpy() for one in noise), batch_size, recorded[-1],
             )  # fmt: skip
             settings = settings._replace(steps=settings.steps + count, made=settings.made + count)
         networks.keep(m, batch_size, [settings.steps] * len(steps))
         self._n_updates += gradient_steps
-        means = np.concatenate(told).mean(axis=0)
+        means = np.concatenate(recorded).mean(axis=0)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", means[sac.ENT_COEF])
         self.logger.record("train/actor_loss", means[sac.ACTOR_LOSS])

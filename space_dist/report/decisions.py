@@ -51,8 +51,8 @@ def explain(
     curriculum = make_curriculum(config, train, bounds)
     state, selection = curriculum.start()
     for row in decided[:iteration]:
-        told = _feedback(scored, row)
-        before, (state, selection, numbers) = state, curriculum.step(state, told)
+        feedback = _feedback(scored, row)
+        before, (state, selection, numbers) = state, curriculum.step(state, feedback)
     if not isinstance(before, SetState) or not isinstance(state, SetState):
         raise TypeError(f"the state of {settings.kind} has no set")
     if trained[iteration : iteration + 1] not in ([], [selection.ids.tolist()]):
@@ -63,7 +63,7 @@ def explain(
     lines = [f"{config.name}, seed {config.seed}, {settings.kind}: iteration {iteration}, {row['steps']:,} steps"]
     lines.append(f"Trained on: S = {before.size} of {len(train)} instances: {_listed(train.ids[before.selected])}")
     if isinstance(settings, GrowingConfig):
-        lines += _growth(settings, told, before, state, numbers)
+        lines += _growth(settings, feedback, before, state, numbers)
         ranking = getattr(settings, "pic", None) or getattr(settings, "distance", None) or settings.kind
         lines.append(
             f"Lines 10-11: d_t(i) = V_t(i) - V_t-1(i), from {_short(numbers['smallest_pic'])} to "
@@ -72,7 +72,7 @@ def explain(
     else:
         lines.append(f"Lines 6-11: {settings.kind} asks no values; the order never changes")
     lines.append(f"Line 12: I_curr := {_listed(selection.ids)}")
-    lines += _table(told, before, state, train)
+    lines += _table(feedback, before, state, train)
     came = "the run has trained on these" if len(trained) > iteration else "the run has not trained on these yet"
     return [*lines, f"Line 13: t := {iteration + 1}; {came}"]
 
@@ -86,14 +86,14 @@ def _feedback(scored: list[Row], row: Row) -> Feedback:
 
 
 def _growth(
-    settings: GrowingConfig, told: Feedback, before: SetState, after: SetState, numbers: Row
+    settings: GrowingConfig, feedback: Feedback, before: SetState, after: SetState, numbers: Row
 ) -> Iterator[str]:  # fmt: skip
     inside = np.sort(before.selected)
-    read = readings(told.values_before[inside], told.values_after[inside], before.mean_value)
+    read = readings(feedback.values_before[inside], feedback.values_after[inside], before.mean_value)
     reading = read[settings.mean]
     yield f"Line 6: V_t = {_short(after.mean_value)}, V_t-1 = {_short(reading.reference)} (mean: {settings.mean})"
     eta = numbers["eta"]
-    if not told.gradient_steps:
+    if not feedback.gradient_steps:
         yield "Line 7: not tested, for the iteration made no gradient step"
     elif eta is None:
         yield f"Line 7: not asked (growth: {settings.growth})"
@@ -113,13 +113,13 @@ def _growth(
     )  # fmt: skip
 
 
-def _table(told: Feedback, before: SetState, after: SetState, train: InstanceSet) -> Iterator[str]:
+def _table(feedback: Feedback, before: SetState, after: SetState, train: InstanceSet) -> Iterator[str]:
     """The first of the next set in its order, then those of the last set that dropped out."""
     yield f"{'':8}{'id':>8} {'V_t-1':>12} {'V_t':>12} {'d_t':>12}"
     dropped = before.selected[~np.isin(before.selected, after.selected)]
     for what, indices in (("next", after.selected), ("dropped", dropped)):
         for one in indices[:_SHOWN].tolist():
-            old, new = told.values_before[one], told.values_after[one]
+            old, new = feedback.values_before[one], feedback.values_after[one]
             yield f"{what:8}{train.ids[one]:>8} {old:>12.6g} {new:>12.6g} {new - old:>12.6g}"
         if len(indices) > _SHOWN:
             yield f"{what:8}{'...':>8} and {len(indices) - _SHOWN} more"

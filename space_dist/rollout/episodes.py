@@ -16,7 +16,7 @@ from space_dist.rollout import Shard
 FloatArray = NDArray[np.float64]
 
 
-def told(train: InstanceSet, shards: Sequence[Shard], advantages: FloatArray | None) -> Episodes:
+def curriculum_episodes(train: InstanceSet, shards: Sequence[Shard], advantages: FloatArray | None) -> Episodes:
     """A round's episodes for the curriculum, shard after shard; their start values are not known.
 
     advantages: (m,) mean |GAE| of each; None where nobody asks for it.

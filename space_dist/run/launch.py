@@ -142,7 +142,7 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
     Raises as `launch` does.
     """
     # Environments are made and reset from here on.
-    with exits_refused(), _zero_exits_told(), _begun(config, folder, resume=resume, stop=stop) as active:
+    with exits_refused(), _zero_exits_reported(), _begun(config, folder, resume=resume, stop=stop) as active:
         yield active
 
 
@@ -408,7 +408,7 @@ _restore: list[Callable[[int], NoReturn]] = []  # what `os._exit` is otherwise
 
 
 @contextlib.contextmanager
-def _zero_exits_told() -> Iterator[None]:
+def _zero_exits_reported() -> Iterator[None]:
     """Keep `os._exit(0)` from ending a run that is not done with the exit code of one that is.
 
     It cannot be caught, so it is stood in for while a run is unfinished. What ends the process from C is not noticed:
@@ -418,7 +418,7 @@ def _zero_exits_told() -> Iterator[None]:
     if not _at_work:
         end, owner = os._exit, os.getpid()
 
-        def told(code: int) -> NoReturn:
+        def reported(code: int) -> NoReturn:
             if code == 0 and os.getpid() == owner:  # processes that were forked end so
                 code = os.EX_SOFTWARE
                 what = "the environment, or something that it uses, ended the process (os._exit(0))"
@@ -428,7 +428,7 @@ def _zero_exits_told() -> Iterator[None]:
             end(code)
 
         _restore.append(end)
-        os._exit = told  # type: ignore[assignment]
+        os._exit = reported  # type: ignore[assignment]
     mine = object()
     _at_work.append(mine)
     try:

@@ -51,7 +51,7 @@ from space_dist.ledger import (
     encode_values,
 )
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
-from space_dist.rollout.episodes import joined_episodes, mean_sizes, summed, told
+from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, summed
 from space_dist.rollout.policy import Statistics, blind, members_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import ensemble_of, learner_of, load_learner, model_of, total_steps
@@ -391,7 +391,7 @@ class Training:
         """Note what a round's episodes and its update showed."""
         run, wants = self._run, self._curriculum.wants
         if wants.episodes:
-            run.seen.append(told(self._setup.train, shards, self._advantages(shards, update)))
+            run.seen.append(curriculum_episodes(self._setup.train, shards, self._advantages(shards, update)))
         run.rollouts.append(summed(shards, lag=run.round - 1 - shards[0].policy_version))
         run.updates.append(update.metrics)
         run.gradient_steps += update.gradient_steps
@@ -407,7 +407,7 @@ class Training:
 
     def _finish(self) -> Work[None]:
         run = self._run
-        if run.rollouts:  # the budget ended inside an iteration: its steps are told, its decision never falls
+        if run.rollouts:  # the budget ended inside an iteration: its steps are logged, its decision is never made
             yield from self._settle()
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
             run.rollouts, run.updates, run.seen = [], [], []

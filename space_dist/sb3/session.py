@@ -53,7 +53,7 @@ from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Outcomes, Setup, Worker, endless
-from space_dist.rollout.episodes import joined_episodes, mean_sizes, told
+from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes
 from space_dist.rollout.policy import Valuing
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.run.cluster import CurriculumHost, Evidence
@@ -328,7 +328,7 @@ class Session:
                 sizes = np.concatenate(self._sizes_now)
                 before = np.zeros(sizes.shape[1]) if self.sizes is None else self.sizes
                 means, self.sizes = mean_sizes([shard], sizes, before)
-            self.seen.append(told(self.env.instances, [shard], means))
+            self.seen.append(curriculum_episodes(self.env.instances, [shard], means))
         if self._ensemble is not None:
             self._ensemble.update([shard], self.wrapped.statistics, round=shard.round)
         if self.rounds_left > 0:

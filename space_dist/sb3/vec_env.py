@@ -239,8 +239,8 @@ class ContextVecEnv(VecEnv):
 
     def _infos(self, truncated: NDArray[np.bool_]) -> list[dict[str, Any]]:
         env = unwrapped(self._batched)
-        told: Sequence[Mapping[str, Any]] = env.infos if isinstance(env, BatchedSingles) else [{}] * self.num_envs
-        return [{**info, "TimeLimit.truncated": bool(cut)} for info, cut in zip(told, truncated, strict=True)]
+        given: Sequence[Mapping[str, Any]] = env.infos if isinstance(env, BatchedSingles) else [{}] * self.num_envs
+        return [{**info, "TimeLimit.truncated": bool(cut)} for info, cut in zip(given, truncated, strict=True)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Have `seed` decide the seeds of all episodes to come."""
