@@ -149,7 +149,7 @@ def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(
     private_ray()
     import ray
 
-    from space_dist.grid.jobs import _memory_of_a_place
+    from space_dist.grid.jobs import _memory_per_process
 
     manifest = plan(write_grid(tmp_path, resources={"workers": 1}), tmp_path / "runs").manifest
     gigabyte = 2.0**30
@@ -160,14 +160,14 @@ def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(
     monkeypatch.setattr(ray, "nodes", lambda: nodes)
     for name in ("SLURM_MEM_PER_CPU", "SLURM_MEM_PER_NODE"):
         monkeypatch.delenv(name, raising=False)
-    assert _memory_of_a_place(manifest, "auto") == _memory_of_a_place(manifest, "local") == 4096.0
+    assert _memory_per_process(manifest, "auto") == _memory_per_process(manifest, "local") == 4096.0
     monkeypatch.setenv("SLURM_MEM_PER_CPU", "1000")
-    assert (_memory_of_a_place(manifest, "auto"), _memory_of_a_place(manifest, "local")) == (4096.0, 2000.0)
+    assert (_memory_per_process(manifest, "auto"), _memory_per_process(manifest, "local")) == (4096.0, 2000.0)
     monkeypatch.setenv("SLURM_MEM_PER_NODE", "900")
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "1")
-    assert _memory_of_a_place(manifest, "local") == 1800.0
+    assert _memory_per_process(manifest, "local") == 1800.0
     monkeypatch.setattr(ray, "nodes", list)
-    assert _memory_of_a_place(manifest, "auto") == math.inf
+    assert _memory_per_process(manifest, "auto") == math.inf
 
 
 def test_the_nonces_of_killed_conductors_go_with_the_next_ones(tmp_path: Path) -> None:

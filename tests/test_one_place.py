@@ -18,7 +18,7 @@ from space_dist.experiment.manifest import Grid
 from space_dist.experiment.status import Attempts
 from space_dist.grid import warm
 from space_dist.grid.planning import plan
-from space_dist.grid.warm import OnePlace, memory_of_a_core, one_place_is_enough
+from space_dist.grid.warm import LocalExecutor, local_is_enough, memory_of_a_core
 from space_dist.ledger import METRICS, Row
 from tests import prepared
 from tests.grids import TINY, write_grid, write_line_instances
@@ -139,7 +139,7 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
     made = plan(write(tmp_path), tmp_path / "runs")
     run = made.manifest.runs()[0]
     found: list[tuple[Any, Ended | None]] = []
-    with OnePlace(made.grid, made.manifest, lambda: None) as place:
+    with LocalExecutor(made.grid, made.manifest, lambda: None) as place:
         place.start([(run, 1)])
         assert place.room() == 0
         await_(lambda: Attempts(made.grid.ledger(run)).history().begun == 1, "the attempt to begin")
@@ -157,13 +157,13 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
 def test_ray_is_for_runs_with_actors_and_for_several_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     manifest = plan(write(tmp_path), tmp_path / "runs").manifest
     runs = manifest.runs()
-    assert one_place_is_enough(manifest, runs, 1)
-    assert one_place_is_enough(manifest, runs[:1], None)
-    assert not one_place_is_enough(manifest, runs, 2)
+    assert local_is_enough(manifest, runs, 1)
+    assert local_is_enough(manifest, runs[:1], None)
+    assert not local_is_enough(manifest, runs, 2)
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "1")
-    assert one_place_is_enough(manifest, runs, None)
+    assert local_is_enough(manifest, runs, None)
     with_actors = plan(write(tmp_path, name="acting", resources={"workers": 1}), tmp_path / "runs").manifest
-    assert not one_place_is_enough(with_actors, with_actors.runs(), 1)
+    assert not local_is_enough(with_actors, with_actors.runs(), 1)
 
 
 def test_a_place_has_a_cores_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:

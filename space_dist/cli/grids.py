@@ -330,7 +330,7 @@ def run_frozen(
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
     _prepare(address)
     from space_dist.grid.conductor import Conductor, working_on
-    from space_dist.grid.warm import OnePlace, one_place_is_enough
+    from space_dist.grid.warm import LocalExecutor, local_is_enough
 
     runs = _part(manifest.runs(), part)
     _log_to(place)
@@ -338,8 +338,8 @@ def run_frozen(
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
         observe = stack.enter_context(_display(manifest, place))
-        if address == "local" and one_place_is_enough(manifest, runs, max_parallel):
-            here = stack.enter_context(OnePlace(place, manifest, STOP.reason))
+        if address == "local" and local_is_enough(manifest, runs, max_parallel):
+            here = stack.enter_context(LocalExecutor(place, manifest, STOP.reason))
             return Conductor(
                 place, manifest, runs, here, stop_requested=STOP.reason, observe=observe
             ).conduct()  # fmt: skip

@@ -127,11 +127,11 @@ def _frozen(path: Path) -> tuple[Manifest, Mapping[str, bytes]]:
 
     with contextlib.ExitStack() as stack:
         if path.is_dir() or path.name == MANIFEST:
-            place = find_grid(path, path)
+            grid = find_grid(path, path)
         else:
-            place = plan(path, Path(stack.enter_context(tempfile.TemporaryDirectory()))).grid
-        manifest = place.manifest()
-        return manifest, place.instance_files(manifest)
+            grid = plan(path, Path(stack.enter_context(tempfile.TemporaryDirectory()))).grid
+        manifest = grid.manifest()
+        return manifest, grid.instance_files(manifest)
 
 
 def _bash() -> str:

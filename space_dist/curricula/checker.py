@@ -106,9 +106,11 @@ class _Check:
         """Where it begins is decided by seed and instances."""
         used = self._make()
         first, again, other = (_called(_START, one.start) for one in (used, used, self._make()))
-        if (place := _difference(again, other)) is not None or (place := _difference(first, other)) is not None:
+        if (difference := _difference(again, other)) is not None or (
+            difference := _difference(first, other)
+        ) is not None:
             raise _FaultError(
-                f"start() is not a function of instances and seed: asked again, it gives another {_place(place)}. "
+                f"start() is not a function of instances and seed: asked again, it gives another {_named(difference)}. "
                 f"{_WHERE_FROM}"
             )
 
@@ -142,31 +144,31 @@ class _Check:
         given = copy.deepcopy((state, feedback))
         answer: tuple[State, Selection, Any] = _called(what, lambda: used.step(*given))
         for name, before, after in zip(("state", "feedback"), (state, feedback), given, strict=True):
-            if (place := _difference(before, after, name)) is not None:
+            if (difference := _difference(before, after, name)) is not None:
                 raise _FaultError(
-                    f"step() changes {place}, which it was given, in place; whoever asks again would ask something "
+                    f"step() changes {difference}, which it was given, in place; whoever asks again would ask something "
                     "else. Copy it first"
                 )
         begun = [copy.deepcopy((one, feedback)) for one in (state, state, restored)]
         new = [_called(f"{what}, of an object that made no decision before,", functools.partial(self._step_anew, *one),
                        hint=". What it remembers must be in its state") for one in begun]  # fmt: skip
-        if (place := _difference(new[0], new[1])) is not None:
+        if (difference := _difference(new[0], new[1])) is not None:
             raise _FaultError(
-                f"two new objects, given the same state and feedback, give another {_place(place)} each (decision "
+                f"two new objects, given the same state and feedback, give another {_named(difference)} each (decision "
                 f"{decision}): it is not a function of these. {_WHERE_FROM}"
             )
         again = _called(what, lambda: used.step(*copy.deepcopy((state, feedback))))
         for one in (again, answer):
-            if (place := _difference(one, new[0])) is not None:
+            if (difference := _difference(one, new[0])) is not None:
                 raise _FaultError(
-                    f"the object remembers something that is not in its state: it gives another {_place(place)} than a "
+                    f"the object remembers something that is not in its state: it gives another {_named(difference)} than a "
                     f"new one that is given the same state and feedback (decision {decision}). Put all that changes, "
                     "that of random generators included, into the state; attributes must stay as __init__ made them"
                 )
-        if (place := _difference(new[2], new[0])) is not None:
+        if (difference := _difference(new[2], new[0])) is not None:
             raise _FaultError(
                 "the state does not survive storing: as a checkpoint gives it back, it leads to another "
-                f"{_place(place)} (decision {decision})"
+                f"{_named(difference)} (decision {decision})"
             )
         return answer
 
@@ -182,12 +184,12 @@ class _Check:
             f"{kind.__name__}, made of its fields as they are stored,",
             lambda: decode_state(kind, stored.arrays, stored.data["curriculum"]),
         )
-        if (place := _difference(state, restored, kind.__name__)) is not None:
-            raise _FaultError(f"the state does not survive storing: {place} comes back as another")
+        if (difference := _difference(state, restored, kind.__name__)) is not None:
+            raise _FaultError(f"the state does not survive storing: {difference} comes back as another")
         again = _called(_SELECTION, lambda: self._make().selection(restored))
-        if (place := _difference(selection, again, "selection")) is not None:
+        if (difference := _difference(selection, again, "selection")) is not None:
             raise _FaultError(
-                f"selection() of a state gives another {place} than start() or step() returned with it; a run "
+                f"selection() of a state gives another {difference} than start() or step() returned with it; a run "
                 "that goes on would train on something else"
             )
         return restored
@@ -305,11 +307,11 @@ def _difference(one: Any, other: Any, name: str = "") -> str | None:
         same = (floats or type(one) is type(other)) and equal
         return None if same else name
     found = (_difference(here, there, part) for part, here, there in pairs)
-    return next((place for place in found if place is not None), None)
+    return next((one for one in found if one is not None), None)
 
 
-def _place(place: str) -> str:
-    return place or "answer"
+def _named(part: str) -> str:
+    return part or "answer"
 
 
 def _called(what: str, call: Callable[[], Any], hint: str = "") -> Any:

@@ -93,12 +93,12 @@ class Executor(Protocol):
 
     @property
     def memory_mb(self) -> float:
-        """What a process may use, in MB, if all places are taken; infinite if nobody knows."""
+        """What a process may use, in MB, if as many run as may; infinite if nobody knows."""
 
     def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """Begin attempts (runs, and which attempt of theirs), in one process that takes the room of one run.
 
-        Raises SpaceDistError if the place itself is gone.
+        Raises SpaceDistError if what it runs on is gone.
         """
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
@@ -155,7 +155,7 @@ class Conductor:
             if self._elsewhere and time.monotonic() - looked > _ELSEWHERE_SECONDS:
                 looked = time.monotonic()
                 for run in list(self._elsewhere.values()):
-                    self._place(run)
+                    self._enqueue(run)
                     self._end_if_abandoned(run)
             self._show()
             time.sleep(_TICK_SECONDS)
@@ -172,9 +172,9 @@ class Conductor:
             if run.key in adopted:
                 self._live[run.key] = run
             else:
-                self._place(run)
+                self._enqueue(run)
 
-    def _place(self, run: Run, delay: float = 0.0) -> None:
+    def _enqueue(self, run: Run, delay: float = 0.0) -> None:
         """Put a run where its files say it belongs."""
         self._elsewhere.pop(run.key, None)
         run_status = run_status_of(run, self._grid.ledger(run), self._manifest.retry, code_digest())
@@ -260,7 +260,7 @@ class Conductor:
         log.warning("%s: %s%s: %s", run.title, ended.cause.in_words, ", trying again" if again else "", ended.detail)
         self._overview.message = f"{run.title}: {ended.cause.in_words}"
         delay = min(_MAX_DELAY, _FIRST_DELAY * 2 ** max(0, history.ends.get(ended.cause, 0) - 1))
-        self._place(run, 0.0 if self._has_got_on(run) else delay)
+        self._enqueue(run, 0.0 if self._has_got_on(run) else delay)
 
     def _has_got_on(self, run: Run) -> bool:
         """Whether its last attempt has committed anything: then it is not the run that makes its attempts fail."""

@@ -71,7 +71,7 @@ def conduct(
         _await_nodes(nodes, stop_requested)
         size = _room_for(manifest, max_parallel)
         in_jobs = address != "local" and _as_jobs(grid, manifest, runs, mode)
-        pool_size, memory_mb = min(size, max(1, len(runs))), _memory_of_a_place(manifest, address)
+        pool_size, memory_mb = min(size, max(1, len(runs))), _memory_per_process(manifest, address)
         with (
             Jobs(grid, manifest, size, memory_mb, dashboard)
             if in_jobs
@@ -129,7 +129,7 @@ def _room_for(manifest: Manifest, max_parallel: int | None) -> int:
     return fits if max_parallel is None else min(fits, max_parallel)
 
 
-def _memory_of_a_place(manifest: Manifest, address: str) -> float:
+def _memory_per_process(manifest: Manifest, address: str) -> float:
     """Of the CPUs that a run takes, in MB, on the node that has least of it for each CPU; infinite if none says."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
     shares = [node.get("memory", math.inf) / node["CPU"] / 2**20 for node in nodes if node.get("CPU")]

@@ -143,7 +143,7 @@ def supervisor_lost(reason: str | None) -> Evidence:
     return Evidence(gone="supervisor", all_asked=reason or "")
 
 
-class OnePlace:
+class LocalExecutor:
     """An `Executor` of one place on this machine, for runs without rollout actors: there is nothing for Ray to do."""
 
     size = 1
@@ -156,7 +156,7 @@ class OnePlace:
         self._not_before = self._looked = 0.0
         self.memory_mb = memory_of_a_core()
 
-    def __enter__(self) -> OnePlace:
+    def __enter__(self) -> LocalExecutor:
         return self
 
     def __exit__(
@@ -210,7 +210,7 @@ class OnePlace:
             self._supervisor.kill_if_stopped()
 
 
-def one_place_is_enough(manifest: Manifest, runs: Sequence[Run], max_parallel: int | None) -> bool:
+def local_is_enough(manifest: Manifest, runs: Sequence[Run], max_parallel: int | None) -> bool:
     """Whether all there is to do here is done one after another, by processes that need no Ray themselves."""
     return not manifest.resources.workers and min(max_parallel or cores(), len(runs)) <= 1
 

@@ -15,11 +15,14 @@ class Gaussian:
     """Independent normal actions; means are the actor's outputs, log_std a parameter of its own."""
 
     def __init__(self, stack: Stack, means: torch.Tensor, gradients: torch.Tensor) -> None:
-        place, self._dimensions = stack.layout.log_std, stack.shape.outputs
+        log_std, self._dimensions = stack.layout.log_std, stack.shape.outputs
         width = rounded_up(self._dimensions, ROWS)
         self._means, self._gradients = means, gradients
         self._wide = stack.weights[:, ACTOR, :width]  # whole vectors
-        self._log_std, self._log_std_gradient = place.of(stack.weights)[:, ACTOR], place.of(stack.gradient)[:, ACTOR]
+        self._log_std, self._log_std_gradient = (
+            log_std.of(stack.weights)[:, ACTOR],
+            log_std.of(stack.gradient)[:, ACTOR],
+        )
         self._exponential = torch.empty_like(self._wide, memory_format=torch.contiguous_format)
         self._inverse = self._exponential[:, : self._dimensions, None]
 

@@ -26,7 +26,7 @@ BETAS, EPS = (0.9, 0.999), 1e-5  # Adam's, in SB3's actor-critic policies
 
 
 @dataclass(frozen=True)
-class Place:
+class ParameterSlice:
     """Where a parameter lies within the row of a network."""
 
     first: int
@@ -46,16 +46,16 @@ class Layout:
 
     def __init__(self, shape: Shape) -> None:
         self._length = 0
-        self.log_std = self._place(shape.outputs)
+        self.log_std = self._reserve(shape.outputs)
         sizes = shape.sizes
         self.weights, self.biases = [], []
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
             last = layer == len(sizes) - 2
-            self.weights.append(self._place(n_out, n_in) if last else self._place(n_in, n_out))
-            self.biases.append(self._place(n_out))
+            self.weights.append(self._reserve(n_out, n_in) if last else self._reserve(n_in, n_out))
+            self.biases.append(self._reserve(n_out))
         self.names = dict(self._names(shape))
 
-    def _names(self, shape: Shape) -> Iterator[tuple[str, tuple[int, Place, bool]]]:
+    def _names(self, shape: Shape) -> Iterator[tuple[str, tuple[int, ParameterSlice, bool]]]:
         if not shape.discrete:
             yield "log_std", (ACTOR, self.log_std, False)
         for network, name, head in ((ACTOR, "policy", "action"), (CRITIC, "value", "value")):
@@ -65,10 +65,10 @@ class Layout:
             yield f"{head}_net.weight", (network, self.weights[-1], False)
             yield f"{head}_net.bias", (network, self.biases[-1], False)
 
-    def _place(self, *shape: int) -> Place:
-        place = Place(self._length, shape)
+    def _reserve(self, *shape: int) -> ParameterSlice:
+        part = ParameterSlice(self._length, shape)
         self._length = rounded_up(self._length + math.prod(shape), 16)
-        return place
+        return part
 
     @property
     def length(self) -> int:
@@ -95,8 +95,8 @@ class Stack:
 
     def parameter(self, rows: torch.Tensor, name: str) -> torch.Tensor:
         """`(P, ...)` view of the parameter that SB3 calls `name`, laid out as SB3's, in one of our (P, 2, length)."""
-        network, place, transposed = self.layout.names[name]
-        found = place.of(rows[:, network])
+        network, part, transposed = self.layout.names[name]
+        found = part.of(rows[:, network])
         if name.startswith("value_net."):
             found = found[:, :1]
         return found.transpose(1, 2) if transposed else found
@@ -124,11 +124,11 @@ class Networks:
         self._layout = layout = stack.layout
         shape, count = stack.shape, len(weights)
         self._tanh = shape.activation == "tanh"
-        self._weights = [place.of(weights) for place in layout.weights]
-        self._biases = [place.of(weights)[:, None, :] for place in layout.biases[:-1]]
+        self._weights = [part.of(weights) for part in layout.weights]
+        self._biases = [part.of(weights)[:, None, :] for part in layout.biases[:-1]]
         self._biases.append(layout.biases[-1].of(weights)[:, :, None])
-        self._weight_gradients = [place.of(gradient) for place in layout.weights]
-        self._bias_gradients = [place.of(gradient) for place in layout.biases]
+        self._weight_gradients = [part.of(gradient) for part in layout.weights]
+        self._bias_gradients = [part.of(gradient) for part in layout.biases]
 
         def empty(*sizes: int) -> torch.Tensor:
             return torch.zeros(count, *sizes, device=stack.device, dtype=stack.dtype)
@@ -140,7 +140,7 @@ class Networks:
             empty(rows, n) if keep or units is None or units.shape[2] != n else units for n, units in above
         ]  # fmt: skip
         self._moved = [empty(rows, n) for n in shape.hidden] if keep else []
-        self._scratch = [empty(*place.shape) for place in layout.weights]
+        self._scratch = [empty(*part.shape) for part in layout.weights]
         self.outputs = empty(shape.outputs, rows)
         self.output_gradients = empty(shape.outputs, rows)
         self._weights_turned, self._hidden_turned, self._output_gradients_turned = (

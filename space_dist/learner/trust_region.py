@@ -65,9 +65,9 @@ class TRPO:
         first = 0
         for name, (network, _, _) in stack.layout.names.items():
             if network == ACTOR:
-                place = stack.parameter(self._start, name)
-                last = first + place[0].numel()
-                place.copy_(noise[:, first:last].view(place.shape))
+                parameter = stack.parameter(self._start, name)
+                last = first + parameter[0].numel()
+                parameter.copy_(noise[:, first:last].view(parameter.shape))
                 first = last
         self._parts = parts_of(stack, packed, batch_size, normalized)
         self._critics = {

@@ -108,11 +108,11 @@ def attended(
     """
     started: Started | None = found["started"]
     where = "of our own" if started else f"at {address!r} (resources.address, or --address)"
-    places = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
+    addresses = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
     if started is not None:
         started.look()
     try:
-        with watched(places, where, started, gone=gone, note=note):
+        with watched(addresses, where, started, gone=gone, note=note):
             yield
     finally:
         late = f"the Ray {where} did not shut down in {SILENT_SECONDS:.0f} s. What was committed is intact"

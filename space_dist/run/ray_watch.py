@@ -65,12 +65,12 @@ def asked(address: str, seconds: float = _ASK_SECONDS) -> Literal["answers", "si
 
 def reach(address: str, raise_if_stopped: Callable[[], None]) -> None:
     """Wait until HOST:PORT answers, for 30 s at most; other addresses are Ray's to find. Raises SpaceDistError."""
-    place = address.rpartition("://")[2]
-    host, _, port = place.rpartition(":")
+    target = address.rpartition("://")[2]
+    host, _, port = target.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         return
     until = time.monotonic() + REACH_SECONDS
-    while (found := asked(place, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
+    while (found := asked(target, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
         raise_if_stopped()
         if time.monotonic() > until:
             what = "nobody listens there" if found == "gone" else "what listens there does not answer"
@@ -176,15 +176,15 @@ def bounded(
 
 @contextlib.contextmanager
 def watched(
-    places: Mapping[str, str], where: str, started: Started | None, *, gone: bool, note: Note = nowhere
+    addresses: Mapping[str, str], where: str, started: Started | None, *, gone: bool, note: Note = nowhere
 ) -> Iterator[None]:  # fmt: skip
-    """Ask the parts of a Ray, `places` (name -> HOST:PORT), all the while; end the process with 75 if one hangs.
+    """Ask the parts of a Ray, `addresses` (name -> HOST:PORT), all the while; end the process with 75 if one hangs.
 
     where: of which Ray, for people. started: what it consists of, if it is our own, which is then killed. gone: whether
     one that nobody listens at any more is the end, too. note: is told of the end.
     """
     over = threading.Event()
-    threading.Thread(target=_watch, args=(places, where, started, gone, over, note), daemon=True).start()
+    threading.Thread(target=_watch, args=(addresses, where, started, gone, over, note), daemon=True).start()
     try:
         yield
     finally:
@@ -192,19 +192,19 @@ def watched(
 
 
 def _watch(
-    places: Mapping[str, str], where: str, started: Started | None, gone: bool, over: threading.Event, note: Note
+    addresses: Mapping[str, str], where: str, started: Started | None, gone: bool, over: threading.Event, note: Note
 ) -> None:  # fmt: skip
     """The clock counts at most what asking takes: a process that was itself stopped, or slept, blames nobody."""
     limits = {"silent": SILENT_SECONDS, "gone": GONE_SECONDS if started else OTHERS_GONE_SECONDS}
-    since = {name: dict.fromkeys(limits, 0.0) for name in places}
+    since = {name: dict.fromkeys(limits, 0.0) for name in addresses}
     last, looked = time.monotonic(), 0.0
     while not over.wait(_PAUSE_SECONDS):
         if started is not None and time.monotonic() - looked > _LOOK_SECONDS:
             started.look()
             looked = time.monotonic()
-        found = {name: asked(place) for name, place in places.items()}
+        found = {name: asked(target) for name, target in addresses.items()}
         now = time.monotonic()
-        took, last = min(now - last, 1.5 * (len(places) * _ASK_SECONDS + _PAUSE_SECONDS)), now
+        took, last = min(now - last, 1.5 * (len(addresses) * _ASK_SECONDS + _PAUSE_SECONDS)), now
         for name, answer in found.items():
             if answer == "answers":
                 since[name] = dict.fromkeys(limits, 0.0)

@@ -174,10 +174,10 @@ def export(
 
     Raises ConfigError if the folder holds another grid, or cannot be written.
     """
-    place = Grid(folder)
-    if place.manifest_file.exists():
+    there = Grid(folder)
+    if there.manifest_file.exists():
         try:
-            other = place.manifest().runs_digest != grid.manifest.runs_digest
+            other = there.manifest().runs_digest != grid.manifest.runs_digest
         except LedgerError:
             other = True
         if other:
@@ -192,8 +192,8 @@ def export(
             written.append(folder / name)
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
-    place.freeze(grid.manifest, instances)
-    return [*written, place.manifest_file]
+    there.freeze(grid.manifest, instances)
+    return [*written, there.manifest_file]
 
 
 def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
@@ -217,14 +217,16 @@ def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
                 f"template {error.filename or error.name}, line {error.lineno}: {error.message}"
             ) from None
         except RecursionError as error:
-            raise ConfigError(f"template {_place(template, error)}: it includes itself, or what includes it") from None
+            raise ConfigError(
+                f"template {_location(template, error)}: it includes itself, or what includes it"
+            ) from None
         except Exception as error:  # a template may compute anything
             what = error.message if isinstance(error, jinja2.TemplateError) else f"{type(error).__name__}: {error}"
-            raise ConfigError(f"template {_place(template, error)}: {what}") from None
+            raise ConfigError(f"template {_location(template, error)}: {what}") from None
     return texts
 
 
-def _place(template: str, error: Exception) -> str:
+def _location(template: str, error: Exception) -> str:
     """Where in a template an error lies, as Jinja2 writes it into the traceback: file and line."""
     inside = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(".j2")]
     return f"{inside[-1].filename}, line {inside[-1].lineno}" if inside else template
