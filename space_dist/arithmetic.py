@@ -74,7 +74,7 @@ def settle() -> None:
     loaded = [name for name in ("numpy", "torch") if name in sys.modules]
     if before != SETTINGS and loaded:
         _late.extend(loaded)
-        if digest(numpy_probes()) != REFERENCE["numpy"]:  # on some CPUs the libraries' own choice is the same
+        if digest(numpy_checks()) != REFERENCE["numpy"]:  # on some CPUs the libraries' own choice is the same
             warnings.warn(
                 f"{' and '.join(loaded)} had been imported before space_dist, too late for the settings that make "
                 "results the same on every CPU: import space_dist first",
@@ -137,10 +137,10 @@ def remarks(found: str) -> list[str]:
     ]
 
 
-def digest(probes: Iterable[tuple[str, Any]]) -> str:
-    """`(16 hex digits)` a hash of what probes computed: equal for processes that compute the same bits."""
+def digest(checks: Iterable[tuple[str, Any]]) -> str:
+    """`(16 hex digits)` a hash of what checks computed: equal for processes that compute the same bits."""
     total = hashlib.sha256()
-    for name, values in probes:
+    for name, values in checks:
         total.update(name.encode())
         total.update(values.tobytes())
     return total.hexdigest()[:_DIGITS]
@@ -149,14 +149,14 @@ def digest(probes: Iterable[tuple[str, Any]]) -> str:
 @functools.cache
 def numpy_digest() -> str:
     """`digest` of what every process of ours computes with, actors included: NumPy and the system's libm."""
-    return digest(numpy_probes())
+    return digest(numpy_checks())
 
 
-def numpy_probes() -> Iterator[tuple[str, NDArray[Any]]]:
+def numpy_checks() -> Iterator[tuple[str, NDArray[Any]]]:
     """What NumPy and libm compute of fixed numbers, by kernel; a few milliseconds."""
     import numpy as np
 
-    # Numbers from integers alone: what is probed must not depend on what is to be probed.
+    # Numbers from integers alone: what is checked must not depend on what is to be checked.
     values: Any
     ramp = (np.arange(4096, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(11)).astype(np.float64)
     doubles = ramp * 2.0**-52 - 1.0  # in [-1, 1)
@@ -193,7 +193,7 @@ def numpy_probes() -> Iterator[tuple[str, NDArray[Any]]]:
     ])  # fmt: skip
 
 
-def scipy_probes() -> Iterator[tuple[str, NDArray[Any]]]:
+def scipy_checks() -> Iterator[tuple[str, NDArray[Any]]]:
     """What SciPy's linear algebra computes, of which SPDRL's optimiser and the reports' statistics are made."""
     import numpy as np
     from scipy import linalg, special

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from space_dist import config as configs
-from space_dist.arithmetic import digest, scipy_probes
+from space_dist.arithmetic import digest, scipy_checks
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import METRICS, Ledger
 from space_dist.run import ray_actors
@@ -120,8 +120,8 @@ def test_actors_are_compared_by_all_that_they_compute_with(
         for part in parts:
             with pytest.raises(SpaceDistError, match=rf"computes other bits than this process with {part} \(0 there"):
                 ray_actors.refuse_other_arithmetic(0, {**found, part: "0"})
-    monkeypatch.setattr(ray_actors, "scipy_probes", lambda: iter([("qr", np.zeros(1))]))
-    assert ray_actors.computed(["scipy"]) != {"scipy": digest(scipy_probes())}
+    monkeypatch.setattr(ray_actors, "scipy_checks", lambda: iter([("qr", np.zeros(1))]))
+    assert ray_actors.computed(["scipy"]) != {"scipy": digest(scipy_checks())}
 
 
 def test_actors_close_their_environments_where_a_run_ends(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.arithmetic import REFERENCE, SETTINGS, digest, numpy_digest, remarks, settle
 from space_dist.errors import ConfigError
-from space_dist.learner import torch_probes
+from space_dist.learner import torch_checks
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.patience import PATIENCE
@@ -79,8 +79,8 @@ def test_the_digest_is_of_bits() -> None:
     moved[3] = np.nextafter(moved[3], 1.0)
     assert digest([("a", values)]) != digest([("a", moved)])
     assert digest([("a", values)]) != digest([("b", values)])
-    assert numpy_digest() == digest(arithmetic.numpy_probes())
-    assert digest(torch_probes()) == digest(torch_probes())
+    assert numpy_digest() == digest(arithmetic.numpy_checks())
+    assert digest(torch_checks()) == digest(torch_checks())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -29,7 +29,7 @@ from space_dist.config import (
 from space_dist.errors import ConfigError
 from space_dist.kernels import COMPILES
 from space_dist.learner.coupled import CoupledLearner
-from space_dist.learner.elementary import torch_probes  # and replaces kernels of torch
+from space_dist.learner.elementary import torch_checks  # and replaces kernels of torch
 from space_dist.learner.ensemble import Ensemble
 from space_dist.learner.interface import Arrays, Learner, SB3Learner, Update, refuse_spaces
 from space_dist.learner.networks import is_mlp
@@ -121,5 +121,5 @@ __all__ = [
     "refuse_population",
     "refuse_spaces",
     "stack_key",
-    "torch_probes",
+    "torch_checks",
 ]

@@ -1,4 +1,4 @@
-"""Functions of torch's whose bits depend on the CPU, or are slow where they don't, by NumPy; a probe of the others.
+"""Functions of torch's whose bits depend on the CPU, or are slow where they don't, by NumPy; a check of the others.
 
 torch computes some elementary functions of contiguous tensors with MKL's vector library, which starts from the CPU's
 own approximations (`rsqrtps`, `rcpps`) in all of its code paths, `MKL_CBWR=COMPATIBLE` included; these approximations
@@ -130,7 +130,7 @@ _PRODUCTS: dict[str, Callable[..., torch.Tensor]] = {
 _library = _replace() if chosen() != "native" else None  # holds for as long as this is kept
 
 
-def torch_probes() -> Iterator[tuple[str, NDArray[Any]]]:
+def torch_checks() -> Iterator[tuple[str, NDArray[Any]]]:
     """What torch computes of fixed numbers, by kernel; a few milliseconds. Global generators are left as they were."""
     ramp = (np.arange(4096, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(11)).astype(np.float64)
     values = torch.from_numpy((ramp * 2.0**-52 - 1.0).astype(np.float32))

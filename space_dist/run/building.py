@@ -54,12 +54,12 @@ def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, tes
         keep_next_observations=config.learner.keeps_next_observations,
         members=config.members,
     )
-    probes = config.learner.normalize_observations or config.learner.normalize_rewards
-    needed = config.round_steps(spec.horizon) * (2 if probes else 1)
+    scales = config.learner.normalize_observations or config.learner.normalize_rewards
+    needed = config.round_steps(spec.horizon) * (2 if scales else 1)
     if config.budget.steps < needed:
         raise ConfigError(
             f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
-            + (", and the round before it that gives normalisation its first scales" if probes else "")
+            + (", and the round before it that gives normalisation its first scales" if scales else "")
         )
     refuse_spaces(config.learner, spec.observation_space, spec.action_space)
     if config.engine == "population":

@@ -38,7 +38,7 @@ from space_dist.errors import (
     nearest,
 )
 from space_dist.instances import ContextBounds, InstanceSet, read_csv, refuse_overlap
-from space_dist.learner import refuse_machine, torch_probes
+from space_dist.learner import refuse_machine, torch_checks
 from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
@@ -257,8 +257,8 @@ def _also_decide(config: RunConfig) -> list[str]:
 @functools.cache
 def arithmetic_digest() -> str:
     """`arithmetic.digest` of all that a run computes with: it is what bits depend on, instead of the CPU's name."""
-    probes = (arithmetic.numpy_probes(), arithmetic.scipy_probes(), torch_probes())
-    return arithmetic.digest(itertools.chain(*probes))
+    checks = (arithmetic.numpy_checks(), arithmetic.scipy_checks(), torch_checks())
+    return arithmetic.digest(itertools.chain(*checks))
 
 
 def _status_before(ledger: Ledger) -> Status | None:

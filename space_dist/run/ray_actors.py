@@ -12,7 +12,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import digest, numpy_digest, scipy_probes
+from space_dist.arithmetic import digest, numpy_digest, scipy_checks
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.errors import SpaceDistError, exits_refused
@@ -90,11 +90,11 @@ def computed(parts: Iterable[str]) -> dict[str, str]:
         if part == "numpy":
             found[part] = numpy_digest()
         elif part == "scipy":
-            found[part] = digest(scipy_probes())
+            found[part] = digest(scipy_checks())
         elif part == "torch":
-            from space_dist.learner import torch_probes  # likewise
+            from space_dist.learner import torch_checks  # likewise
 
-            found[part] = digest(torch_probes())
+            found[part] = digest(torch_checks())
         else:
             found[part] = importlib.metadata.version(part)
     return found

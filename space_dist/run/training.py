@@ -60,7 +60,7 @@ from space_dist.run.state import RunState
 
 log = logging.getLogger("space_dist")
 
-PROBE = (1 << 32) - 1  # the round in which first scales are measured
+SCALES_ROUND = (1 << 32) - 1  # the round in which first scales are measured
 
 
 @dataclass
@@ -195,7 +195,7 @@ class Training:
     def _begin(self) -> Work[Handle]:
         cluster = self._cluster
         if self.learner.normalises:
-            yield from self._probe()
+            yield from self._measure_scales()
         policy = cluster.put(self.learner.policy(0))
         first = cluster.begin(cluster.start_values(policy))
         self._adopt(first)
@@ -206,7 +206,7 @@ class Training:
         self._evaluate(policy)
         return policy
 
-    def _probe(self) -> Work[None]:
+    def _measure_scales(self) -> Work[None]:
         """One round of actions that ignore the observation gives the first scales; its steps count like any others.
 
         Its episodes are not gone on with: they say nothing about the policy.
@@ -214,9 +214,9 @@ class Training:
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
         (seeing,) = members_of(self.learner.policy(0))
-        policy = blind(seeing, self._setup.spec.action_space, PROBE)
+        policy = blind(seeing, self._setup.spec.action_space, SCALES_ROUND)
         handles = cluster.collect(
-            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=PROBE, steps=0, version=selection.version
+            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=SCALES_ROUND, steps=0, version=selection.version
         )  # fmt: skip
         shards: list[Shard] = yield Wait(handles)
         self.learner.observe(shards)

@@ -56,9 +56,9 @@ def address_facing(peer: str, interface: str | None = None) -> str:
 
 
 def _source_towards(peer: str) -> str | None:
-    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect((peer, 9))  # sends nothing
-        address: str = probe.getsockname()[0]
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.connect((peer, 9))  # sends nothing
+        address: str = udp.getsockname()[0]
         return address
     return None
 
