@@ -12,7 +12,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
 from space_dist.ledger import Ledger
-from space_dist.rollout.policy import members_of
+from space_dist.rollout.policy import policies_of
 from space_dist.run.building import spec_of
 from space_dist.run.launch import launch, policy_of
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
@@ -46,7 +46,7 @@ def test_sb3_acts_as_the_run_does(
     monkeypatch.chdir(tmp_path)
     assert command(monkeypatch, "export-sb3", "run", "--out", "made/policy") == 0
     told = capsys.readouterr().out
-    policies = members_of(policy_of(Ledger(tmp_path / "run"), spec_of(config)))
+    policies = policies_of(policy_of(Ledger(tmp_path / "run"), spec_of(config)))
     files = sorted(Path("made").glob("*.zip"))
     assert len(files) == len(policies)
     for file, policy in zip(files, policies, strict=True):

@@ -20,7 +20,7 @@ from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.learner import CoupledLearner
 from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.rollout import Shard, Worker, collecting
-from space_dist.rollout.policy import members_of
+from space_dist.rollout.policy import policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import learner_of, make_setup, memory_of, spec_of
 from space_dist.run.launch import Outcome, launch, policy_of, read_instances
@@ -240,22 +240,22 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
     learner = learner_of(config, spec)
     assert isinstance(learner, CoupledLearner)
     policy, worker = learner.policy(0), Worker(setup)
-    own = [worker.start_values(member, 0) for member in policy.members]
+    own = [worker.start_values(member, 0) for member in policy.policies]
     assert np.array_equal(worker.start_values(policy, 0), np.mean(own, axis=0))
     assert not np.array_equal(own[0], own[1])
     selection = make_curriculum(config, setup.train, spec.context_bounds).start()[1]
     asked = {"round": 0, "steps": 0, "selection_version": 0}
     shards = [worker.collect(policy, selection, Walk(-1, ()), shard=number, **asked) for number in range(setup.shards)]
-    single = Worker(dataclasses.replace(setup, members=1))
+    single = Worker(dataclasses.replace(setup, policies=1))
     for number, shard in enumerate(shards):  # each policy's own, with random numbers of its own
-        member = policy.members[number // 4]
+        member = policy.policies[number // 4]
         again = single.collect(member, selection, Walk(-1, ()), shard=number, **asked)
         assert np.array_equal(shard.actions, again.actions)
     alone = learner_of(config, spec)
     assert isinstance(alone, CoupledLearner)
     before = learner.scored()
     update = learner.update(shards, round=0, steps=3 * N_STEPS)
-    for member, mine in zip(alone.members, alone.parts(shards), strict=True):
+    for member, mine in zip(alone.learners, alone.parts(shards), strict=True):
         made = member.update(mine, round=0, steps=3 * N_STEPS)
         assert made.gradient_steps == update.gradient_steps
     ours, theirs = learner.scored(), alone.scored()
@@ -303,11 +303,11 @@ def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:
     first = Ledger(tmp_path / "run").rows()[0]
     spec = spec_of(config)
     learner, setup = learner_of(config, spec), make_setup(config, spec, *read_instances(config, spec.context_bounds))
-    single = Worker(dataclasses.replace(setup, members=1, shards=1))
+    single = Worker(dataclasses.replace(setup, policies=1, shards=1))
     outcomes = [single.evaluate(member, "test", 0).returns.reshape(-1, 2).mean(axis=1)
-                for member in members_of(learner.policy(0))]  # fmt: skip
+                for member in policies_of(learner.policy(0))]  # fmt: skip
     assert first["test"]["returns"] == pytest.approx(np.mean(outcomes, axis=0).tolist(), abs=1e-6)
-    assert len(members_of(policy_of(Ledger(tmp_path / "run"), spec))) == 3
+    assert len(policies_of(policy_of(Ledger(tmp_path / "run"), spec))) == 3
 
 
 @pytest.mark.parametrize(

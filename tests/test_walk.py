@@ -522,7 +522,7 @@ def test_where_episodes_end_early_counts_differ_by_no_more_than_shards_and_slots
 
 def test_every_member_of_a_population_meets_the_whole_selection() -> None:
     four = setup(
-        shards=8, members=4, train=InstanceSet(np.arange(24), uniform(24), ("gate_x", "gate_width", "friction"))
+        shards=8, policies=4, train=InstanceSet(np.arange(24), uniform(24), ("gate_x", "gate_width", "friction"))
     )
     selection = Selection(0, four.train.ids, four.train.contexts, 0)
     fresh = Walk(-1, ())

@@ -78,7 +78,7 @@ def evaluate(
     from space_dist.ledger import Ledger
     from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
-    from space_dist.rollout.policy import members_of
+    from space_dist.rollout.policy import policies_of
     from space_dist.run.building import spec_of
     from space_dist.run.launch import policy_of, stored_config
     from space_dist.seeding import Purpose, episode_seeds
@@ -88,7 +88,7 @@ def evaluate(
     state = "abandoned" if ledger.abandoned(status) else status.state
     config = stored_config(ledger)
     spec = spec_of(config)
-    policies = members_of(policy_of(ledger, spec))
+    policies = policies_of(policy_of(ledger, spec))
     chosen = read_csv(instances, spec.context_bounds, config.curriculum.columns_read, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     optimum = None

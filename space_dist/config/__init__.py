@@ -944,7 +944,7 @@ class RunConfig(Section):
 
     @model_validator(mode="after")
     def _population_shares_a_curriculum(self) -> Self:
-        if self.members == 1:
+        if self.n_policies == 1:
             return self
         if self.engine == "single" or not self.learner.can_be_stacked:
             raise ValueError("curriculum.aggregate: population needs engine: population, and learner.kind: ppo or trpo")
@@ -978,7 +978,7 @@ class RunConfig(Section):
         return self
 
     @property
-    def members(self) -> int:
+    def n_policies(self) -> int:
         """Policies that the run trains."""
         return self.curriculum.policies_trained
 
@@ -1001,7 +1001,7 @@ class RunConfig(Section):
 
     def round_steps(self, horizon: int) -> int:
         """Environment steps of a round; the most there can be, where rounds end by episodes."""
-        return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots * self.members
+        return self.slot_length(horizon) * self.rollout.shards * self.rollout.slots * self.n_policies
 
 
 NOT_IDENTITY = ("name", "checkpoint", "tracking", "resources")  # what cannot change a result

@@ -87,7 +87,7 @@ class Feedback:
         iteration's updates, in reward units.
     gradient_steps: how many the iteration made on the network that is scored.
     episodes: the iteration's, if `Wants.episodes`.
-    members: (n, members) start values of all instances by each member of an ensemble, if `Wants.ensemble`.
+    ensemble: (n, members) start values of all instances by each member of an ensemble, if `Wants.ensemble`.
     probes: of the instances that `Curriculum.probes` named; None where it named none, or the budget had no room.
     """
 
@@ -96,7 +96,7 @@ class Feedback:
     values_after: FloatArray
     gradient_steps: int
     episodes: Episodes | None = None
-    members: FloatArray | None = None
+    ensemble: FloatArray | None = None
     probes: Probes | None = None
 
 
@@ -106,7 +106,7 @@ class Wants:
 
     episodes: `Feedback.episodes`.
     advantages: `Episodes.advantages`, which only learners with advantages have.
-    ensemble: an ensemble of value functions, trained on the rollouts, and its `Feedback.members`.
+    ensemble: an ensemble of value functions, trained on the rollouts, and its `Feedback.ensemble`.
     probes: to be asked, by `Curriculum.probes`, which instances shall be probed; the environment must report success.
     """
 

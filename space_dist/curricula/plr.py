@@ -109,8 +109,8 @@ class LevelReplay(Drawn):
             drawn = self._by_chance(state.version, state.chances)
         else:
             begun = (state.last >= 0) | runs
-            members = np.flatnonzero(begun if begun.any() else ~begun)
-            ranked = members[np.lexsort((self._ties[members], -state.scores[members]))]
+            candidates = np.flatnonzero(begun if begun.any() else ~begun)
+            ranked = candidates[np.lexsort((self._ties[candidates], -state.scores[candidates]))]
             # Draws of what was never seen are episodes as well: what was seen is staler behind them.
             now = state.episodes - 1 + len(unseen)
             random = generator(self._seed, Purpose.DRAWS, state.version).random((self._draws.count - len(unseen), 2))

@@ -132,9 +132,9 @@ class Space(Curriculum):
 
     def _membership(self, indices: IntArray) -> Members:
         """`(n,)` whether an instance is among `indices`; means over it do not depend on their order."""
-        members = np.zeros(len(self._instances), dtype=np.bool_)
-        members[indices] = True
-        return members
+        inside = np.zeros(len(self._instances), dtype=np.bool_)
+        inside[indices] = True
+        return inside
 
     def selection(self, state: SetState) -> Selection:
         """The instances a state has selected."""
@@ -152,6 +152,6 @@ def _highest(scores: FloatArray, size: int, ties: UInt64Array) -> IntArray:
     tied = np.zeros(len(order) + 1, dtype=np.bool_)
     tied[1:-1] = ranked[1:] == ranked[:-1]
     if tied.any():  # the order within a tie is still the sort's own whim
-        members = tied[1:] | tied[:-1]
-        order[members] = order[members][np.lexsort((ties[order[members]], -ranked[members]))]
+        inside = tied[1:] | tied[:-1]
+        order[inside] = order[inside][np.lexsort((ties[order[inside]], -ranked[inside]))]
     return order[:size]

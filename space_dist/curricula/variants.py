@@ -77,12 +77,12 @@ def near_member(scaled: FloatArray) -> Rank:
     """
 
     def rank(feedback: Feedback, trained: Members) -> FloatArray:  # noqa: ARG001 - a Rank
-        members, others = scaled[trained], np.flatnonzero(~trained)
+        chosen, others = scaled[trained], np.flatnonzero(~trained)
         scores = np.ones(len(scaled))  # not 0, which is the score of a stranger with a member's context
-        rows = max(1, _CHUNK_NUMBERS // members.size)
+        rows = max(1, _CHUNK_NUMBERS // chosen.size)
         for start in range(0, len(others), rows):
             some = others[start : start + rows]
-            scores[some] = -np.linalg.norm(scaled[some, None] - members, axis=2).min(axis=1)
+            scores[some] = -np.linalg.norm(scaled[some, None] - chosen, axis=2).min(axis=1)
         return scores
 
     return rank

@@ -24,9 +24,9 @@ class ValueDisagreement(Drawn):
 
     def step(self, state: DrawnState, feedback: Feedback) -> tuple[DrawnState, Selection, Numbers]:
         """The next chances; equal ones where nobody disagrees."""
-        if feedback.members is None:
+        if feedback.ensemble is None:
             raise ValueError("VDS needs the values of an ensemble")
-        found = disagreement(feedback.members)
+        found = disagreement(feedback.ensemble)
         new = DrawnState(state.version + 1, proportional(found, floor=FLOOR))
         numbers = self._numbers(feedback, new.chances)
         numbers |= {"mean_disagreement": float(found.mean()), "largest_disagreement": float(found.max())}

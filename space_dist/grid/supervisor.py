@@ -255,8 +255,8 @@ class _Watch:
             for attempts in self.attempts:
                 attempts.sign()
         used, state = self._used()
-        limit, members = self.resources.memory_mb, len(self.attempts)
-        if limit is not None and used > members * limit << 20:
+        limit, count = self.resources.memory_mb, len(self.attempts)
+        if limit is not None and used > count * limit << 20:
             self._end(dataclasses.replace(self.seen, over_memory=(used >> 20, limit)))
         self.stopped_since = (self.stopped_since or now) if state == psutil.STATUS_STOPPED else None
         if self.stopped_since is not None and now - self.stopped_since > STOPPED_SECONDS:
@@ -265,7 +265,7 @@ class _Watch:
             minutes, asked_by = self.resources.minutes, stop_requested()
             if asked_by is not None:
                 self._ask(dataclasses.replace(self.seen, asked_by=asked_by))
-            elif minutes is not None and now - self.began > 60.0 * minutes * members:
+            elif minutes is not None and now - self.began > 60.0 * minutes * count:
                 self._ask(dataclasses.replace(self.seen, over_minutes=minutes))
         elif now > self.kill_at:
             self.child.kill()

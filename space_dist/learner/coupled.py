@@ -17,7 +17,7 @@ from space_dist.rollout.policy import Several, Statistics
 
 
 class CoupledLearner:
-    """`len(members)` learners with seeds of their own; each learns from its own equal part of a round's shards.
+    """`len(learners)` learners with seeds of their own; each learns from its own equal part of a round's shards.
 
     A `Learner`: to the curriculum they are one, and an instance's value is the mean of theirs (`policy.Several`).
     """
@@ -26,38 +26,38 @@ class CoupledLearner:
     statistics = Statistics()
     seen = capacity = 0
 
-    def __init__(self, members: Sequence[PopulationLearner]) -> None:
-        self.members = tuple(members)
+    def __init__(self, learners: Sequence[PopulationLearner]) -> None:
+        self.learners = tuple(learners)
 
     @property
     def policy_name(self) -> str:
         """See `Learner`."""
-        return self.members[0].policy_name
+        return self.learners[0].policy_name
 
     def policy(self, version: int) -> Several:
         """See `Learner`."""
-        return Several(version, tuple(member.policy(version) for member in self.members))
+        return Several(version, tuple(learner.policy(version) for learner in self.learners))
 
     def scored(self) -> Arrays:
-        """See `Learner`: of all members."""
-        return {f"{number}/{name}": array for number, member in enumerate(self.members)
-                for name, array in member.scored().items()}  # fmt: skip
+        """See `Learner`: of all learners."""
+        return {f"{number}/{name}": array for number, learner in enumerate(self.learners)
+                for name, array in learner.scored().items()}  # fmt: skip
 
     def policy_of(self, scored: Mapping[str, NDArray[Any]], version: int) -> Several:
         """See `Learner`."""
-        each = (member.policy_of(_under(number, scored), version) for number, member in enumerate(self.members))
+        each = (learner.policy_of(_under(number, scored), version) for number, learner in enumerate(self.learners))
         return Several(version, tuple(each))
 
     def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
         """See `Learner`."""
-        each = len(shards) // len(self.members)
+        each = len(shards) // len(self.learners)
         return [
             [dataclasses.replace(shard, shard=number) for number, shard in enumerate(shards[first : first + each])]
             for first in range(0, len(shards), each)
         ]
 
     def combined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
-        """See `Learner`: means of what the members report."""
+        """See `Learner`: means of what the learners report."""
         done = []
         for update in updates:
             if isinstance(update, SpaceDistError):
@@ -70,24 +70,24 @@ class CoupledLearner:
     def update(
         self, shards: Sequence[Shard], *, round: int, steps: int, acted: Mapping[str, NDArray[Any]] | None = None
     ) -> Update:  # fmt: skip
-        """See `Learner`; `steps` are those of all members together."""
+        """See `Learner`; `steps` are those of all policies together."""
         if acted is not None:
             raise RuntimeError("a population learns from rounds of its present weights only")
-        count = len(self.members)
+        count = len(self.learners)
         return self.combined(
-            learn_together(self.members, self.parts(shards), round=[round] * count, steps=[steps] * count)
+            learn_together(self.learners, self.parts(shards), round=[round] * count, steps=[steps] * count)
         )
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
         """See `Learner`."""
-        saved = [member.save() for member in self.members]
+        saved = [learner.save() for learner in self.learners]
         arrays = {f"{number}/{name}": array for number, (mine, _) in enumerate(saved) for name, array in mine.items()}
         return arrays, {str(number): data for number, (_, data) in enumerate(saved)}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
         """See `Learner`."""
-        for number, member in enumerate(self.members):
-            member.load(_under(number, arrays), data[str(number)])
+        for number, learner in enumerate(self.learners):
+            learner.load(_under(number, arrays), data[str(number)])
 
     def transitions(self, first: int) -> Arrays:  # noqa: ARG002 - there is no replay buffer
         """See `Learner`."""
@@ -102,6 +102,6 @@ class CoupledLearner:
 
 
 def _under(number: int, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """One member's, of arrays that are named by members."""
+    """One learner's, of arrays that are named by learners."""
     prefix = f"{number}/"
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

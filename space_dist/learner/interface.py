@@ -50,7 +50,7 @@ class Learner(Protocol):
     """
 
     @property
-    def members(self) -> Sequence[PopulationLearner]:
+    def learners(self) -> Sequence[PopulationLearner]:
         """Those whose updates, made together with others', make this one's; none where it is made alone."""
 
     @property
@@ -87,10 +87,10 @@ class Learner(Protocol):
         """
 
     def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
-        """The shards of each of `members`, counted from 0."""
+        """The shards of each of `learners`, counted from 0."""
 
     def combined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
-        """The updates of `members` as one. Raises what one of them failed with."""
+        """The updates of `learners` as one. Raises what one of them failed with."""
 
     def save(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays and plain data from which `load` restores the learner bit for bit; replay buffers apart."""
@@ -198,7 +198,7 @@ class SB3Learner(abc.ABC):
             self.model.policy.load_state_dict({name: torch.as_tensor(array) for name, array in now.items()})
 
     @property
-    def members(self) -> Sequence[PopulationLearner]:
+    def learners(self) -> Sequence[PopulationLearner]:
         """See `Learner`."""
         return ()
 
@@ -209,7 +209,7 @@ class SB3Learner(abc.ABC):
 
     def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
         """See `Learner`."""
-        return [list(shards) for _ in self.members]
+        return [list(shards) for _ in self.learners]
 
     def combined(self, updates: Sequence[Update | SpaceDistError]) -> Update:
         """See `Learner`."""

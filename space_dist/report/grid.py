@@ -277,16 +277,16 @@ def pool(cells: Sequence[CellRuns]) -> list[Pooled]:
         if len(groups) < 2 or max(map(len, groups.values())) < 2:
             continue
         name = short_names(keys)[key]
-        for members in groups.values():
+        for group in groups.values():
             if len(found) == MAX_POOLED:
                 return found
-            strata = [cell.finals for cell in members if len(cell.finals)]
+            strata = [cell.finals for cell in group if len(cell.finals)]
             found.append(
                 Pooled(
-                    f"{name}={word(members[0].settings[key])}",
-                    len(members),
+                    f"{name}={word(group[0].settings[key])}",
+                    len(group),
                     sum(map(len, strata)),
-                    sum(cell.summary.n_runs for cell in members),
+                    sum(cell.summary.n_runs for cell in group),
                     stratified(strata) if strata else Interval(math.nan),
                 )
             )
@@ -306,22 +306,22 @@ def heat_maps(cells: Sequence[CellRuns]) -> list[HeatMap]:
         return key in ("extends", "curriculum") or key.endswith(".kind") or _is_of_task(key) or key in lists
 
     maps = []
-    for place, members in grouped(cells, keys, apart).items():
-        inner = [key for key in varying(members) if not apart(key)]
-        if len(inner) == 2 and all(key in cell.settings for key in inner for cell in members):
-            across, down = ([*dict.fromkeys(word(cell.settings[key]) for cell in members)] for key in inner)
-            if len(members) > max(len(across), len(down)):
-                maps.append(_heat_map(place, inner, across, down, members))
+    for place, group in grouped(cells, keys, apart).items():
+        inner = [key for key in varying(group) if not apart(key)]
+        if len(inner) == 2 and all(key in cell.settings for key in inner for cell in group):
+            across, down = ([*dict.fromkeys(word(cell.settings[key]) for cell in group)] for key in inner)
+            if len(group) > max(len(across), len(down)):
+                maps.append(_heat_map(place, inner, across, down, group))
     return maps[:MAX_MAPS]
 
 
 def _heat_map(
-    place: tuple[str, ...], keys: Sequence[str], across: list[str], down: list[str], members: Sequence[CellRuns]
+    place: tuple[str, ...], keys: Sequence[str], across: list[str], down: list[str], group: Sequence[CellRuns]
 ) -> HeatMap:
     shape = (len(down), len(across))
     means, spreads = np.full(shape, np.nan), np.full(shape, np.nan)
     seeds = [[""] * len(across) for _ in down]
-    for cell in members:
+    for cell in group:
         row, column = down.index(word(cell.settings[keys[1]])), across.index(word(cell.settings[keys[0]]))
         values = cell.finals
         means[row, column] = values.mean() if len(values) else np.nan

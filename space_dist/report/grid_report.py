@@ -358,12 +358,12 @@ def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
         parts = {at: list(cells[at : at + _CURVES_PER_PANEL]) for at in range(0, len(cells), _CURVES_PER_PANEL)}
         groups = {(f"cells {at + 1} to {at + len(part)}",): part for at, part in parts.items()}
 
-    def curves(members: Sequence[CellRuns]) -> list[Configuration]:
-        return [cell.configuration for cell in members if cell is not baseline]
+    def curves(group: Sequence[CellRuns]) -> list[Configuration]:
+        return [cell.configuration for cell in group if cell is not baseline]
 
     reference = baseline.configuration if baseline.configuration.drawn else None
-    return [Panel(", ".join(place), curves(members), reference if members[0].task == baseline.task else None)
-            for place, members in groups.items() if curves(members)]  # fmt: skip
+    return [Panel(", ".join(place), curves(group), reference if group[0].task == baseline.task else None)
+            for place, group in groups.items() if curves(group)]  # fmt: skip
 
 
 def _maps(cells: Sequence[CellRuns]) -> list[Section]:

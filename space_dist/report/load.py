@@ -224,11 +224,11 @@ def group(runs: Sequence[Run]) -> list[Configuration]:
     Where a seed is there twice, their names tell configurations apart. Raises ConfigError if a seed is there twice
     under one name.
     """
-    members: dict[str, list[Run]] = {}
+    group: dict[str, list[Run]] = {}
     for run in runs:
-        members.setdefault(_identity(run), []).append(run)
+        group.setdefault(_identity(run), []).append(run)
     parts: list[tuple[str, str, list[Run]]] = []  # name, identity, runs
-    for identity, alike in members.items():
+    for identity, alike in group.items():
         names = list(dict.fromkeys(run.status.name for run in alike))
         if len({run.status.seed for run in alike}) == len(alike):
             parts.append((" + ".join(names), identity, alike))

@@ -238,7 +238,7 @@ class Several:
         return values
 
 
-def members_of(policy: Policy | Several) -> tuple[Policy, ...]:
+def policies_of(policy: Policy | Several) -> tuple[Policy, ...]:
     """The policies that act."""
     return policy.members if isinstance(policy, Several) else (policy,)
 

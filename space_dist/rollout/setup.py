@@ -13,7 +13,7 @@ from space_dist.envs.spec import EnvironmentSpec
 from space_dist.instances import InstanceSet
 from space_dist.rollout.collecting import Rollout
 from space_dist.rollout.evaluation import Trial
-from space_dist.rollout.policy import Policy, Several, members_of
+from space_dist.rollout.policy import Policy, Several, policies_of
 from space_dist.rollout.walk import IntArray, Walk
 from space_dist.seeding import Purpose, episode_seeds, generator
 
@@ -38,7 +38,7 @@ class Setup:
     test: InstanceSet
     episodes_per_round: int | None = None  # a round ends with this many episodes instead of with its slots' length
     keep_next_observations: bool = False
-    members: int = 1  # policies; each has an equal share of the shards, and of the parts of an evaluation
+    policies: int = 1  # policies; each has an equal share of the shards, and of the parts of an evaluation
 
     def instances(self, split: Split) -> InstanceSet:
         """The instance set of a split."""
@@ -56,16 +56,16 @@ class Setup:
 
     @property
     def walks(self) -> int:
-        """Shards that share an order: a member's. Every member meets the whole selection."""
-        return self.shards // self.members
+        """Shards that share an order: one policy's. Every policy meets the whole selection."""
+        return self.shards // self.policies
 
     @property
     def evaluation_parts(self) -> int:
-        """Pieces into which the evaluation of one split, by every member, is cut."""
+        """Pieces into which the evaluation of one split, by every policy, is cut."""
         return self.shards
 
-    def _member(self, policy: Policy | Several, part: int) -> Policy:
-        return members_of(policy)[part // self.walks]
+    def _policy(self, policy: Policy | Several, part: int) -> Policy:
+        return policies_of(policy)[part // self.walks]
 
     def rollout(
         self, policy: Policy | Several, selection: Selection, walk: Walk,
@@ -81,7 +81,7 @@ class Setup:
                 f"and got selection {selection.version} and policy {policy.version}"
             )
         return Rollout(
-            self._member(policy, shard), selection, start=walk.position(selection, shard, self.walks),
+            self._policy(policy, shard), selection, start=walk.position(selection, shard, self.walks),
             gamma=self.gamma, seed=self.seed, round=round, shard=shard,
             steps=steps + shard * self.slots * self.slot_length, unfinished=walk.running(shard),
         )  # fmt: skip
@@ -90,10 +90,10 @@ class Setup:
         """Episodes on one part of a split: deterministic ones, or `stochastic` ones for the released code's metric."""
         instances, number = self.instances(split), 0 if split == "train" else 1
         count = len(instances) * self.evaluation_episodes
-        parts_each = self.evaluation_parts // self.members
+        parts_each = self.evaluation_parts // self.policies
         mine = np.array_split(np.arange(count), parts_each)[part % parts_each]
         return Trial(
-            self._member(policy, part), instances.contexts[mine // self.evaluation_episodes],
+            self._policy(policy, part), instances.contexts[mine // self.evaluation_episodes],
             episode_seeds(self.seed, Purpose.EVALUATION, number, count=count)[mine], self.gamma,
             functools.partial(generator, self.seed, Purpose.EVALUATION, 2 + number, part) if stochastic else None,
         )  # fmt: skip

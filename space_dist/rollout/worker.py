@@ -9,7 +9,7 @@ from space_dist.envs import BatchedEnv, Observations, close
 from space_dist.envs.observations import distinct, rows, take
 from space_dist.rollout.collecting import Shard, Stage, collect
 from space_dist.rollout.evaluation import Outcomes, Trial, evaluate
-from space_dist.rollout.policy import Policy, Several, Valuing, can_act_side_by_side, members_of
+from space_dist.rollout.policy import Policy, Several, Valuing, can_act_side_by_side, policies_of
 from space_dist.rollout.setup import Setup, Split
 from space_dist.rollout.walk import FloatArray, IntArray, Walk
 from space_dist.seeding import Purpose, episode_seeds
@@ -43,7 +43,7 @@ class Worker:
         """
         setup, shards = self._setup, range(self._setup.shards)
         together = 1 < len(shards) <= LIVE and setup.episodes_per_round is None
-        if not together or not can_act_side_by_side(members_of(policy)):
+        if not together or not can_act_side_by_side(policies_of(policy)):
             return [self.collect(policy, selection, walk, shard=shard, **asked) for shard in shards]
         if _TOGETHER not in self._stages:
             self._stages[_TOGETHER] = Stage(self._make(len(shards) * setup.slots))

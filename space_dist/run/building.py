@@ -43,7 +43,7 @@ def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, tes
         spec=spec,
         seed=config.seed,
         gamma=config.learner.gamma,
-        shards=config.rollout.shards * config.members,
+        shards=config.rollout.shards * config.n_policies,
         slots=config.rollout.slots,
         slot_length=config.slot_length(spec.horizon),
         start_states=config.rollout.start_states,
@@ -52,7 +52,7 @@ def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, tes
         test=test,
         episodes_per_round=config.n_episodes,
         keep_next_observations=config.learner.keeps_next_observations,
-        members=config.members,
+        policies=config.n_policies,
     )
     scales = config.learner.normalize_observations or config.learner.normalize_rewards
     needed = config.round_steps(spec.horizon) * (2 if scales else 1)
@@ -136,15 +136,15 @@ def memory_of(config: RunConfig, spec: EnvironmentSpec) -> int:
     if config.engine != "population" or not config.learner.can_be_stacked:
         return 0
     each = member_bytes(config.learner, spec.observation_space, spec.action_space, config.device)
-    return -(-config.members * each >> 20)
+    return -(-config.n_policies * each >> 20)
 
 
 def learner_of(config: RunConfig, spec: EnvironmentSpec) -> Learner:
     """A config's learner with its initial networks."""
-    if config.members == 1:
+    if config.n_policies == 1:
         return _learner_of(config, spec, config.seed)
-    members = [_learner_of(config, spec, int(seed)) for seed in member_seeds(config.seed, config.members)]
-    return CoupledLearner([one for member in members for one in member.members])
+    coupled = [_learner_of(config, spec, int(seed)) for seed in member_seeds(config.seed, config.n_policies)]
+    return CoupledLearner([one for each in coupled for one in each.learners])
 
 
 def _learner_of(config: RunConfig, spec: EnvironmentSpec, seed: int) -> Learner:

@@ -38,7 +38,7 @@ class Evidence:
 
     after: start values of all instances, chunk by chunk.
     rescored: the values before, chunk by chunk, where scales have changed since and those kept are no longer true.
-    members: start values of all instances by each member of an ensemble, chunk by chunk.
+    ensemble: start values of all instances by each member of an ensemble, chunk by chunk.
     episodes: one `Episodes`, whose start values are filled in where the curriculum is hosted.
     context_values: start values of the episodes' contexts, where those are no instances.
     probes: one `Outcomes` per part.
@@ -46,7 +46,7 @@ class Evidence:
 
     after: Sequence[Handle]
     rescored: Sequence[Handle] = ()
-    members: Sequence[Handle] = ()
+    ensemble: Sequence[Handle] = ()
     episodes: Sequence[Handle] = ()
     context_values: Sequence[Handle] = ()
     probes: Sequence[Handle] = ()
@@ -125,9 +125,9 @@ class CurriculumHost:
         after = checked(np.concatenate(seen["after"]), "start values")
         if seen.get("rescored"):
             before = checked(np.concatenate(seen["rescored"]), "start values")
-        members = checked(np.concatenate(seen["members"]), "values of the ensemble") if seen.get("members") else None
+        ensemble = checked(np.concatenate(seen["ensemble"]), "values of the ensemble") if seen.get("ensemble") else None
         feedback = Feedback(
-            version, before, after, gradient_steps, members=members,
+            version, before, after, gradient_steps, ensemble=ensemble,
             episodes=next(self._valued(seen, after), None), probes=self._probed(state, seen),
         )  # fmt: skip
         new, selection, numbers = self.curriculum.step(state, feedback)

@@ -115,9 +115,9 @@ class _Part:
 
 def _parts_of(folder: Path, request: Learn) -> Iterator[_Part]:
     learner = request.learner
-    if not learner.members:
+    if not learner.learners:
         raise TypeError(f"{folder}: a member of a population needs engine: population")
-    for one, shards in zip(learner.members, learner.parts(request.shards), strict=True):
+    for one, shards in zip(learner.learners, learner.parts(request.shards), strict=True):
         yield _Part(folder, request, one, shards)
 
 

@@ -36,7 +36,7 @@ from space_dist.errors import ConfigError, LedgerError
 from space_dist.instances import InstanceSet, read_csv
 from space_dist.ledger import Ledger
 from space_dist.rollout import Split
-from space_dist.rollout.policy import Policy, members_of
+from space_dist.rollout.policy import Policy, policies_of
 from space_dist.run.launch import policy_of
 from space_dist.seeding import Purpose, episode_seeds
 from space_dist.system.files import atomic_write
@@ -105,7 +105,7 @@ class Gallery:
         env = self._config.env
         picture = {"render_mode": "rgb_array"} if takes_argument(env.id, "render_mode") else {}
         spec = read_spec(env.id, context_visible=env.context_visible, kwargs={**env.kwargs, **picture})
-        self._policy: Policy = members_of(policy_of(ledger, spec))[0]  # the first, where the run trains several
+        self._policy: Policy = policies_of(policy_of(ledger, spec))[0]  # the first, where the run trains several
         self._sets: dict[Split, InstanceSet] = {
             split: read_csv(ledger.instances(split), spec.context_bounds) for split in _SPLITS
         }  # fmt: skip

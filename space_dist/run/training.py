@@ -52,7 +52,7 @@ from space_dist.ledger import (
 )
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
 from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, summed
-from space_dist.rollout.policy import Statistics, blind, members_of
+from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import ensemble_of, learner_of, load_learner, model_of, total_steps
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
@@ -213,7 +213,7 @@ class Training:
         """
         run, cluster = self._run, self._cluster
         selection = self._curriculum.start()[1]
-        (seeing,) = members_of(self.learner.policy(0))
+        (seeing,) = policies_of(self.learner.policy(0))
         policy = blind(seeing, self._setup.spec.action_space, SCALES_ROUND)
         handles = cluster.collect(
             cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=SCALES_ROUND, steps=0, version=selection.version
@@ -281,20 +281,20 @@ class Training:
     def _evidence(self, policy: Handle, probes: list[Outcomes]) -> Evidence:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
-        rescored, members, episodes, context_values = [], [], [], []
+        rescored, ensemble, episodes, context_values = [], [], [], []
         from_zero = run.version == 0 and self._config.curriculum.starts_from_zero
         if self.learner.normalises and not from_zero:
             # Both values at one scale: else a change of scale would look like progress.
             rescored = cluster.start_values(cluster.put(self.learner.policy_of(run.scored, run.round)))
         if self.ensemble is not None:
-            members = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
+            ensemble = cluster.start_values(cluster.put(self.ensemble.policy(self.learner.statistics)))
         if wants.episodes:
             seen = joined_episodes(run.seen)
             episodes = [cluster.put(seen)]
             if (seen.indices == GENERATED).any():
                 context_values = cluster.context_values(policy, seen.contexts, version=run.version)
         return Evidence(
-            after=cluster.start_values(policy), rescored=rescored, members=members, episodes=episodes,
+            after=cluster.start_values(policy), rescored=rescored, ensemble=ensemble, episodes=episodes,
             context_values=context_values, probes=[cluster.put(part) for part in probes],
         )  # fmt: skip
 

@@ -42,9 +42,9 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
     kind, written = _ALGORITHMS[config.learner.kind], []
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        for member in range(config.members):
-            learner = _stock_learner(config, spec, checkpoint, member)
-            path = out if config.members == 1 else out.with_name(f"{out.stem}_{member}.zip")
+        for number in range(config.n_policies):
+            learner = _stock_learner(config, spec, checkpoint, number)
+            path = out if config.n_policies == 1 else out.with_name(f"{out.stem}_{number}.zip")
             model: Any = learner.model
             model.num_timesteps = int(checkpoint.data["run"]["steps"])
             model.save(path)
@@ -58,7 +58,7 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
     return written
 
 
-def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpoint, member: int) -> SB3Learner:
+def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpoint, number: int) -> SB3Learner:
     """A policy's learner as SB3 itself has it, whatever computed the run's updates: their states are the same."""
     changes: dict[str, Any] = {"engine": "single", "device": "cpu"}
     if "update" in type(config.learner).model_fields:
@@ -68,10 +68,10 @@ def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpo
     learner = learner_of(config.model_copy(update=changes), spec)
     if not isinstance(learner, SB3Learner):
         raise TypeError(f"one policy has one learner, not {type(learner).__name__}")
-    several = config.members > 1
-    prefix, data = f"learner/{member}/" if several else "learner/", checkpoint.data["learner"]
+    several = config.n_policies > 1
+    prefix, data = f"learner/{number}/" if several else "learner/", checkpoint.data["learner"]
     arrays = {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
-    learner.load(arrays, data[str(member)] if several else data)
+    learner.load(arrays, data[str(number)] if several else data)
     return learner
 
 

@@ -254,7 +254,7 @@ class Session:
         ensemble = self._ensemble
         evidence = Evidence(
             after=self._start_values(), rescored=rescored, episodes=[] if seen is None else [seen],
-            members=[] if ensemble is None else self._start_values(ensemble.policy(self.wrapped.statistics)),
+            ensemble=[] if ensemble is None else self._start_values(ensemble.policy(self.wrapped.statistics)),
             context_values=context_values, probes=probes,
         )  # fmt: skip
         layout, pieces = evidence.flat()

@@ -447,16 +447,16 @@ def _results(manifest: Manifest, looks: Sequence[Look]) -> list[str]:
         "| cell | id | IQM | mean | least | greatest | seeds done | failed |\n|---|---|---:|---:|---:|---:|---:|---|"
     ]
     for cell in manifest.cells:
-        members = by_cell[cell.id]
-        done = [look for look in members if look.run_status.condition == "done"]
+        group = by_cell[cell.id]
+        done = [look for look in group if look.run_status.condition == "done"]
         finals = np.array([math.nan if look.final is None else look.final for look in done], dtype=np.float64)
         numbers = ["—"] * 4
         if len(finals):
             numbers = [f"{x:.4g}" for x in (interquartile_mean(finals), finals.mean(), finals.min(), finals.max())]
         name = _cell_text(cell.label) + (" (baseline)" if cell.id == manifest.baseline else "")
-        failed = [look.run_status for look in members if look.run_status.condition == "failed"]
+        failed = [look.run_status for look in group if look.run_status.condition == "failed"]
         rows.append(
-            f"| {name} | `{cell.id}` | {' | '.join(numbers)} | {len(done)}/{len(members)} | {_by_cause(failed)} |"
+            f"| {name} | `{cell.id}` | {' | '.join(numbers)} | {len(done)}/{len(group)} | {_by_cause(failed)} |"
         )
     return rows
 
