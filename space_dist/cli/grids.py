@@ -297,7 +297,7 @@ def grid_work(
     nonce: Annotated[str, typer.Option()],
     job: Annotated[str, typer.Option()],
 ) -> None:
-    """One attempt of one run, or of several side by side, as a job of its own."""
+    """One attempt of one run, or of several in one process, as a job of its own."""
     STOP.install()
     from space_dist.experiment.endings import AskedBy, Cause
     from space_dist.grid.pool import refuse_other_folder

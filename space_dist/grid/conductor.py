@@ -217,7 +217,7 @@ class Conductor:
             self._live |= {run.key: run for run in chosen}
 
     def _next(self) -> list[Run]:
-        """The runs to be started next, side by side: one, or an equal share of those that can share a process."""
+        """The runs to be started next, in one process: one, or an equal share of those that can share a process."""
         now = time.monotonic()
         ready = [run for not_before, run in (*self._interrupted, *self._fresh) if not_before <= now]
         if not ready or not ready[0].cell.stack:

@@ -75,7 +75,7 @@ class AttemptId:
 
 @dataclass(frozen=True)
 class Task:
-    """What to attempt, side by side where it is more than one. grid: its folder. address: of the Ray to join.
+    """What to attempt, in one process where it is more than one. grid: its folder. address: of the Ray to join.
 
     where: more about this place (a job's id).
     """

@@ -33,7 +33,7 @@ Values = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Joined:
-    """The slots of all shards side by side: (length, slots, ...) each. ended: whether an episode did, at this step.
+    """The slots of all shards, one shard's after another's: (length, slots, ...) each. ended: whether an episode did, at this step.
 
     starts: (slots,) whether the first step began an episode.
     """
@@ -154,7 +154,7 @@ class OnPolicyLearner(SB3Learner):
         return buffer
 
     def joined(self, shards: Sequence[Shard]) -> Joined:
-        """A round's shards side by side, at the scales that acted."""
+        """A round's shards as one, at the scales that acted."""
         rewards = np.concatenate([shard.rewards for shard in shards], axis=1)
         truncated = np.concatenate([shard.truncated for shard in shards], axis=1)
         return Joined(

@@ -12,7 +12,7 @@ from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, Observations, Step
 from space_dist.envs.observations import allocate, concatenate, put, take
 from space_dist.errors import SpaceDistError
-from space_dist.rollout.policy import Noise, Policy, side_by_side
+from space_dist.rollout.policy import Noise, Policy, batched
 from space_dist.rollout.table import Episodes, EpisodeTable
 from space_dist.rollout.walk import FloatArray, IntArray, Unfinished, Walking
 from space_dist.seeding import Purpose, generator
@@ -163,7 +163,7 @@ def collect(
     stage: Stage, rollouts: Sequence[Rollout], *, length: int, episodes: int | None = None,
     keep_next_observations: bool = False,
 ) -> list[Shard]:  # fmt: skip
-    """Collect `length * slots` transitions for each rollout, side by side: an equal share of the slots is each one's.
+    """Collect `length * slots` transitions for each rollout, in one batch: an equal share of the slots is each one's.
 
     A shard has the same bits whoever is collected beside it, and whether its episodes still run on the stage or are
     played again. Slots that end their episode at the same step take the next instances in slot order. What runs at the
@@ -173,7 +173,7 @@ def collect(
     """
     env, slots = stage.env, stage.env.n_slots // len(rollouts)
     walking, table = Walking(rollouts, slots, length), EpisodeTable(rollouts, slots)
-    acting = side_by_side([rollout.policy for rollout in rollouts], slots)
+    acting = batched([rollout.policy for rollout in rollouts], slots)
     noise = _noise(env, rollouts, (length, slots))
     first_steps = np.concatenate([rollout.steps + np.arange(slots) for rollout in rollouts])
     recording = _Recording(env, length, next_observations=keep_next_observations)

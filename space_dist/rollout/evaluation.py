@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from space_dist.envs import BatchedEnv
 from space_dist.envs.observations import put, take
 from space_dist.rollout.collecting import endless
-from space_dist.rollout.policy import Noise, Policy, side_by_side
+from space_dist.rollout.policy import Noise, Policy, batched
 from space_dist.rollout.walk import FloatArray, IntArray
 
 
@@ -56,12 +56,12 @@ class Trial:
 
 
 def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
-    """Measure trials of equally many episodes side by side, all at once, all deterministic or none.
+    """Measure trials of equally many episodes in one batch, all deterministic or none.
 
     The outcomes of one have the same bits whatever is measured beside it.
     """
     count, slots, n_slots = len(trials[0]), np.arange(env.n_slots), env.n_slots
-    acting = side_by_side([trial.policy for trial in trials], count)
+    acting = batched([trial.policy for trial in trials], count)
     noise = None
     if trials[0].random is not None:
         shape = (env.horizon, count)

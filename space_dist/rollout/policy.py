@@ -298,26 +298,26 @@ def blind(policy: Policy, action_space: spaces.Space[Any], version: int) -> Blin
     return BlindPolicy(version, head, 2 * n_actions if head.kind == "squashed" else n_actions)
 
 
-def side_by_side(policies: Sequence[Policy], rows: int) -> Acting:
+def batched(policies: Sequence[Policy], rows: int) -> Acting:
     """One policy that acts for several, of which each has `rows` rows of the observations, in order.
 
-    Each acts as it does alone, bit for bit. Raises TypeError for several that cannot: see `can_act_side_by_side`.
+    Each acts as it does alone, bit for bit. Raises TypeError for several that cannot: see `can_be_batched`.
     """
     if len(policies) == 1:
         return policies[0]
-    return _SideBySide(policies, rows)
+    return _BatchedPolicies(policies, rows)
 
 
-def can_act_side_by_side(policies: Sequence[Policy]) -> bool:
+def can_be_batched(policies: Sequence[Policy]) -> bool:
     """Whether all are multilayer perceptrons of one shape with the same kind of head, Gaussian or categorical."""
     mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
     shapes = {(one.head.kind, one.activation, *(weight.shape for weight, _ in one.actor)) for one in mlps}
     return len(mlps) == len(policies) and len(shapes) == 1 and mlps[0].head.kind in ("gaussian", "categorical")
 
 
-class _SideBySide:
+class _BatchedPolicies:
     def __init__(self, policies: Sequence[Policy], rows: int) -> None:
-        if not can_act_side_by_side(policies):
+        if not can_be_batched(policies):
             raise TypeError("only multilayer perceptrons of one shape, Gaussian or categorical, act side by side")
         mlps = [policy for policy in policies if isinstance(policy, MlpPolicy)]
         first = mlps[0]

@@ -56,7 +56,7 @@ class EpisodeTable:
         )
         self._starts = -column("lengths")  # at which step of this round; negative: before it
         self.runs = self._starts < 0
-        self.actions = _side_by_side([one.actions for one in known], slots)
+        self.actions = _aligned([one.actions for one in known], slots)
         self.ended = 0
         self._due = 0  # no running episode is as long as the horizon before this step
         self._ended: list[tuple[Any, ...]] = []  # in the order of the fields of `Episodes`
@@ -142,7 +142,7 @@ def _nothing(rollout: Route, slots: int) -> Unfinished:
     return Unfinished(whole, contexts, whole.astype(np.uint64), whole, zeros, zeros, zeros, np.zeros((0, slots)))
 
 
-def _side_by_side(actions: Sequence[NDArray[np.generic]], slots: int) -> NDArray[np.generic]:
+def _aligned(actions: Sequence[NDArray[np.generic]], slots: int) -> NDArray[np.generic]:
     """`(steps, all slots, ...)` from the recorded actions of several shards, whose last steps are everybody's last."""
     longest = max(actions, key=len)
     joined = np.zeros((len(longest), len(actions) * slots, *longest.shape[2:]), dtype=longest.dtype)

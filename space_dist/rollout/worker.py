@@ -9,12 +9,12 @@ from space_dist.envs import BatchedEnv, Observations, close
 from space_dist.envs.observations import distinct, rows, take
 from space_dist.rollout.collecting import Shard, Stage, collect
 from space_dist.rollout.evaluation import Outcomes, Trial, evaluate
-from space_dist.rollout.policy import Policy, Several, Valuing, can_act_side_by_side, policies_of
+from space_dist.rollout.policy import Policy, Several, Valuing, can_be_batched, policies_of
 from space_dist.rollout.setup import Setup, Split
 from space_dist.rollout.walk import FloatArray, IntArray, Walk
 from space_dist.seeding import Purpose, episode_seeds
 
-_SHARED, _TOGETHER = -1, -2  # the stages of all shards beyond LIVE, and of all side by side
+_SHARED, _TOGETHER = -1, -2  # the stages of all shards beyond LIVE, and of all in one batch
 BLOCK = 2_048  # rows of one matrix product: what fits the cache. Part of every result: rows are rounded by their place
 LIVE = 64  # shards whose episodes a worker keeps going between rounds. Decides no result
 
@@ -38,12 +38,12 @@ class Worker:
     def collect_all(self, policy: Policy | Several, selection: Selection, walk: Walk, **asked: int) -> list[Shard]:
         """All shards of one round; `asked`: see `Setup.rollout`.
 
-        They are collected side by side if the policy can act so: a step of many slots takes hardly longer than one of
+        They are collected in one batch if the policy can act so: a step of many slots takes hardly longer than one of
         few. The bits are the same.
         """
         setup, shards = self._setup, range(self._setup.shards)
         together = 1 < len(shards) <= LIVE and setup.episodes_per_round is None
-        if not together or not can_act_side_by_side(policies_of(policy)):
+        if not together or not can_be_batched(policies_of(policy)):
             return [self.collect(policy, selection, walk, shard=shard, **asked) for shard in shards]
         if _TOGETHER not in self._stages:
             self._stages[_TOGETHER] = Stage(self._make(len(shards) * setup.slots))

@@ -1,4 +1,4 @@
-"""Many runs of one shape in one process, side by side: collected, measured and updated together.
+"""Many runs of one shape in one process, in one batch: collected, measured and updated together.
 
 Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a generator (`member`) that says
 what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch of

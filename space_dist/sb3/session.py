@@ -360,7 +360,7 @@ class Session:
         return outcomes
 
     def _played(self, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Outcomes:
-        """Episodes of (k, d) contexts with (k,) seeds, side by side."""
+        """Episodes of (k, d) contexts with (k,) seeds, in one batch."""
         env, count = self.env.make_batched(len(contexts)), len(contexts)
         observations = take(env.reset(np.arange(count), contexts, seeds), slice(None))
         alive, success = np.ones(count, dtype=np.bool_), np.full(count, np.nan)

@@ -128,7 +128,7 @@ class Profile(Section):
     throttle: int | None = Field(default=None, ge=1, le=1_000_000)
     """Array tasks at a time; in cluster mode: runs at a time. null: as many as there is room for."""
     cells_per_task: int = Field(default=1, ge=1, le=100_000)
-    """Runs that an array task does, one after another, or side by side if it has the CPUs. More than 1 suits runs that
+    """Runs that an array task does, one after another, or at once if it has the CPUs. More than 1 suits runs that
     are short beside the half minute it takes to start."""
     max_array_size: int = Field(default=1001, ge=2, le=4_000_001)
     """The site's MaxArraySize (`scontrol show config`). More tasks are written as several arrays."""
