@@ -232,7 +232,8 @@ def grid_logs(
             break
         time.sleep(_WATCH_SECONDS)
     warn(
-        f"{run.title}: {run_status.in_words}, {run_status.steps:,} of {run_status.budget_steps:,} steps. {ledger.folder}"
+        f"{run.title}: {run_status.in_words}, {run_status.steps:,} of {run_status.budget_steps:,} steps. "
+        f"{ledger.folder}"
     )
     if run_status.detail and run_status.condition != "done":
         warn(run_status.detail)
@@ -508,9 +509,8 @@ def _print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
             say(f"{cause.in_words}: {count}")
             for run_status in unwell:
                 if run_status.cause is cause:
-                    say(
-                        f"  {run_status.run.title} ({run_status.run.cell.id}): {run_status.condition}; {_last(run_status)}"
-                    )
+                    run = run_status.run
+                    say(f"  {run.title} ({run.cell.id}): {run_status.condition}; {_last(run_status)}")
         return
     for run_status in unwell[:_SHOWN_RUNS]:
         say(f"{run_status.run.title}: {run_status.in_words}; {_last(run_status)}")

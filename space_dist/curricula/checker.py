@@ -146,8 +146,8 @@ class _Check:
         for name, before, after in zip(("state", "feedback"), (state, feedback), given, strict=True):
             if (difference := _difference(before, after, name)) is not None:
                 raise _FaultError(
-                    f"step() changes {difference}, which it was given, in place; whoever asks again would ask something "
-                    "else. Copy it first"
+                    f"step() changes {difference}, which it was given, in place; whoever asks again would ask "
+                    "something else. Copy it first"
                 )
         begun = [copy.deepcopy((one, feedback)) for one in (state, state, restored)]
         new = [_called(f"{what}, of an object that made no decision before,", functools.partial(self._step_anew, *one),
@@ -161,9 +161,10 @@ class _Check:
         for one in (again, answer):
             if (difference := _difference(one, new[0])) is not None:
                 raise _FaultError(
-                    f"the object remembers something that is not in its state: it gives another {_named(difference)} than a "
-                    f"new one that is given the same state and feedback (decision {decision}). Put all that changes, "
-                    "that of random generators included, into the state; attributes must stay as __init__ made them"
+                    f"the object remembers something that is not in its state: it gives another {_named(difference)} "
+                    f"than a new one that is given the same state and feedback (decision {decision}). Put all that "
+                    "changes, that of random generators included, into the state; attributes must stay as __init__ "
+                    "made them"
                 )
         if (difference := _difference(new[2], new[0])) is not None:
             raise _FaultError(
@@ -261,8 +262,9 @@ class _Check:
     def _feedback(self, used: Custom, state: State, iteration: _Iteration, before: FloatArray) -> Feedback:
         episodes = iteration.episodes if self._wants.episodes else None
         return Feedback(
-            version=state.version, values_before=before, values_after=iteration.values, gradient_steps=iteration.gradient_steps,
-            episodes=episodes, probes=self._probed(used, state, episodes) if self._wants.probes else None,
+            version=state.version, values_before=before, values_after=iteration.values,
+            gradient_steps=iteration.gradient_steps, episodes=episodes,
+            probes=self._probed(used, state, episodes) if self._wants.probes else None,
         )  # fmt: skip
 
     def _probed(self, used: Custom, state: State, episodes: Episodes | None) -> Probes | None:

@@ -18,5 +18,7 @@ def make_curriculum(config: RunConfig, train: InstanceSet, bounds: ContextBounds
     rollout = config.rollout
     return Makers(
         train, source=str(config.instances.train), seed=config.seed, bounds=bounds,
-        draws=Draws(config.n_episodes or config.learner.n_steps * config.n_policies, rollout.shards * config.n_policies),
+        draws=Draws(
+            config.n_episodes or config.learner.n_steps * config.n_policies, rollout.shards * config.n_policies
+        ),
     ).make(config.curriculum)  # fmt: skip

@@ -206,8 +206,8 @@ def update(
     """All epochs and minibatches.
 
     m: the array of a `Layout`.  samples: (n * plan.record,).  orders: (epochs, n) permutations.  size: of minibatches.
-    recorded: (minibatches, N_RECORDED) is filled.  Returns how many minibatches were computed, the last of which makes no step
-    where `target_kl` has stopped the update; how many steps were made; and how many epochs were begun.
+    recorded: (minibatches, N_RECORDED) is filled.  Returns how many minibatches were computed, the last of which makes
+    no step where `target_kl` has stopped the update; how many steps were made; and how many epochs were begun.
     """
     n, done, steps = orders.shape[1], 0, 0
     for epoch in range(len(orders)):

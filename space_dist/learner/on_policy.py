@@ -33,9 +33,9 @@ Values = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Joined:
-    """The slots of all shards, one shard's after another's: (length, slots, ...) each. ended: whether an episode did, at this step.
+    """The slots of all shards, one shard's after another's: (length, slots, ...) each.
 
-    starts: (slots,) whether the first step began an episode.
+    ended: whether an episode did, at this step.  starts: (slots,) whether the first step began an episode.
     """
 
     observations: Observations

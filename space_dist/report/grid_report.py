@@ -421,8 +421,9 @@ def _run_numbers(grid: Grid, cells: Sequence[CellRuns]) -> list[dict[str, Value]
             run = read.get(run_status.run.seed)
             last = run if run is not None and len(run.evaluation_steps) else None
             row: dict[str, Value] = {
-                "cell": cell.cell.id, "label": cell.label, "seed": run_status.run.seed, "condition": run_status.condition,
-                "cause": run_status.cause, "detail": " / ".join(clean(line) for line in run_status.detail.splitlines()),
+                "cell": cell.cell.id, "label": cell.label, "seed": run_status.run.seed,
+                "condition": run_status.condition, "cause": run_status.cause,
+                "detail": " / ".join(clean(line) for line in run_status.detail.splitlines()),
                 "attempts": run_status.attempts, "steps": run_status.steps, "budget_steps": run_status.budget_steps,
                 "last_test_return": None if last is None else last.final("test", "return"),
                 "last_train_return": None if last is None else last.final("train", "return"),

@@ -230,17 +230,17 @@ class Several:
     """Policies that share a curriculum: each acts for itself; a state is worth what they think of it on average."""
 
     version: int
-    members: tuple[Policy, ...]
+    policies: tuple[Policy, ...]
 
     def values(self, observations: Observations) -> NDArray[np.float64]:
-        """`(n, obs_dim) -> (n,)` the mean of the members' values, in unscaled reward units."""
-        values: NDArray[np.float64] = np.mean([member.values(observations) for member in self.members], axis=0)
+        """`(n, obs_dim) -> (n,)` the mean of the policies' values, in unscaled reward units."""
+        values: NDArray[np.float64] = np.mean([policy.values(observations) for policy in self.policies], axis=0)
         return values
 
 
 def policies_of(policy: Policy | Several) -> tuple[Policy, ...]:
     """The policies that act."""
-    return policy.members if isinstance(policy, Several) else (policy,)
+    return policy.policies if isinstance(policy, Several) else (policy,)
 
 
 @dataclass(frozen=True)

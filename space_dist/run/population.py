@@ -1,8 +1,8 @@
 """Many runs of one shape in one process, in one batch: collected, measured and updated together.
 
-Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a generator (`member`) that says
-what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch of
-environments, and once every member waits for its update, all are made in one tensor program. A member's bits do not
+Each member is a run like any other, with its own curriculum, ledger, checkpoint and log: a generator (`member`) that
+says what it waits for. `advance` answers all of them at once: what members want collected or measured becomes one batch
+of environments, and once every member waits for its update, all are made in one tensor program. A member's bits do not
 depend on its companions, so members may be put together in any way, end when they end, and be resumed among others.
 """
 

@@ -106,7 +106,7 @@ def refuse_other_arithmetic(index: int, found: Mapping[str, str]) -> None:
     other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
     if other:
         raise SpaceDistError(
-            f"{name_of(index)} computes other bits than this process with {', '.join(other)}: its node has another kind "
-            "of CPU, or other library versions, and results would depend on who computes what. Keep the run to nodes "
-            "of one kind (resources.address, or the cluster's own constraints)"
+            f"{name_of(index)} computes other bits than this process with {', '.join(other)}: its node has another "
+            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
+            "nodes of one kind (resources.address, or the cluster's own constraints)"
         )

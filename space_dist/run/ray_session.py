@@ -56,9 +56,9 @@ def join_ray(
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
-    not enough on a busy machine. While that lasts, `raise_if_stopped` is called, and may raise what ends it. Raises SpaceDistError
-    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that, and
-    `note` is told.
+    not enough on a busy machine. While that lasts, `raise_if_stopped` is called, and may raise what ends it. Raises
+    SpaceDistError if Ray cannot be started or reached; where it takes our call and does not return, the process ends
+    with that, and `note` is told.
     """
     where = f"at {address!r} (resources.address, or --address)"
     ours = address == "local"

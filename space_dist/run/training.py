@@ -216,7 +216,8 @@ class Training:
         (seeing,) = policies_of(self.learner.policy(0))
         policy = blind(seeing, self._setup.spec.action_space, SCALES_ROUND)
         handles = cluster.collect(
-            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=SCALES_ROUND, steps=0, version=selection.version
+            cluster.put(policy), cluster.put(selection), Walk(-1, ()), round=SCALES_ROUND, steps=0,
+            version=selection.version,
         )  # fmt: skip
         shards: list[Shard] = yield Wait(handles)
         self.learner.observe(shards)
