@@ -739,7 +739,7 @@ def driven(curriculum: Curriculum, train: InstanceSet, steps: int = 4, through: 
             probes = Probes(asked, np.zeros(len(asked)), np.ones(len(asked), dtype=np.int64), success)
         told = feedback(
             version, indices, selection.contexts[some], n=n, returns=random.normal(size=m),
-            advantages=random.random(m), ensemble=random.normal(size=(n, 3)), probes=probes,
+            advantages=random.random(m), members=random.normal(size=(n, 3)), probes=probes,
         )  # fmt: skip
         episodes = dataclasses.replace(
             told.episodes, start_values=random.random(m), discounted_returns=random.random(m)

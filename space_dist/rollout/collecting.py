@@ -115,7 +115,9 @@ class _Recording:
     ) -> IntArray:
         """Keep step `time`, made from observations `before`; returns the slots whose episodes ended with it, in order.
 
-        An episode that reached a terminal state with its last step was not cut off, whatever the environment says.
+        An episode that reached a terminal state with its last step was not cut off, whatever the environment says: what
+        is truncated is bootstrapped (https://github.com/DLR-RM/stable-baselines3/issues/633), and nothing comes behind a
+        terminal state.
         """
         put(self._observations, time, before)
         self._rewards[time] = step.rewards
@@ -180,7 +182,7 @@ def collect(
 
     live = stage.resume([rollout.unfinished for rollout in rollouts])
     current = live if live is not None else replayed(env, table)
-    starts = ~table.runs
+    starts = ~table.runs  # now: the table goes on with the round
     ended = np.flatnonzero(starts)
     for time in range(length):
         if len(ended):

@@ -51,7 +51,7 @@ from space_dist.system.importing import folders_of_user
 _ATTEMPTS = 6  # at one call, or at one actor's start, before something must be wrong with the work itself
 _LOOK_SECONDS = 0.2  # between two looks for what died or is late
 _RESCHEDULING_SECONDS = 5.0  # that Ray gets to find other room for a lost node's actors
-_REMEMBERED = 101  # durations per kind of call, whose median says what is late
+_REMEMBERED = 101  # durations per kind of call, whose median says what is late: a mean would follow the late ones
 _CLOSING_SECONDS = 5.0  # that actors get to close their environments
 _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 

@@ -34,7 +34,7 @@ from space_dist.run.ray_watch import (
     watched,
 )
 
-_OBJECT_STORE_BYTES = 256 << 20
+_OBJECT_STORE_BYTES = 256 << 20  # policies and shards are some MB; Ray's default is 30 % of the memory
 _STARTS = 5  # of a Ray of our own
 _TURN_SECONDS = 300.0  # that one waits for others to be up
 _LOOK_SECONDS = 0.2  # between two looks whether it is
