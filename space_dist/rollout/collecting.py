@@ -116,7 +116,7 @@ class _Recording:
         """Keep step `time`, made from observations `before`; returns the slots whose episodes ended with it, in order.
 
         An episode that reached a terminal state with its last step was not cut off, whatever the environment says: what
-        is truncated is bootstrapped (https://github.com/DLR-RM/stable-baselines3/issues/633), and nothing comes behind a
+        is truncated is bootstrapped (https://github.com/DLR-RM/stable-baselines3/issues/633), and nothing follows a
         terminal state.
         """
         put(self._observations, time, before)
