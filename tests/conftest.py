@@ -97,7 +97,7 @@ def one_ray() -> Iterator[None]:
     private_ray()
     import ray
 
-    from space_dist.run.ray_cluster import join_ray, remove_session
+    from space_dist.run.ray_session import join_ray, remove_session
 
     found = join_ray("local", 5)
     joined = SimpleNamespace(address_info={**found, "session_dir": None})

@@ -16,6 +16,7 @@ from space_dist import config as configs
 from space_dist.arithmetic import digest, scipy_checks
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import METRICS, Ledger
+from space_dist.run import ray_actors
 from space_dist.run.building import learner_of, make_setup, spec_of
 from space_dist.run.launch import launch, read_instances
 from space_dist.system.interrupts import StopRequests
@@ -105,8 +106,6 @@ def test_actors_are_compared_by_all_that_they_compute_with(
     env_id: str, kind: str, rollout: tuple[str, ...], central: tuple[str, ...], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    from space_dist.run import ray_cluster as distributed
-
     policy = {"policy": "MultiInputPolicy"} if env_id.endswith("dict") else {}
     config = config_for(tmp_path, learner_section("ppo", **policy), env_id)
     spec = spec_of(config)
@@ -114,15 +113,15 @@ def test_actors_are_compared_by_all_that_they_compute_with(
     shipped = configs.load(ROOT / "configs/pointmass_space.yaml", [f"curriculum={{kind: {kind}}}"])
     config = config.model_copy(update={"curriculum": shipped.curriculum})
     for wanted, is_central in ((rollout, False), (central, True)):
-        parts = distributed.computes_with(config, setup, central=is_central)
+        parts = ray_actors.computes_with(config, setup, central=is_central)
         assert parts == ("numpy", *wanted)
-        found = distributed.computed(parts)
-        distributed.refuse_other_arithmetic(0, found)
+        found = ray_actors.computed(parts)
+        ray_actors.refuse_other_arithmetic(0, found)
         for part in parts:
             with pytest.raises(SpaceDistError, match=rf"computes other bits than this process with {part} \(0 there"):
-                distributed.refuse_other_arithmetic(0, {**found, part: "0"})
-    monkeypatch.setattr(distributed, "scipy_checks", lambda: iter([("qr", np.zeros(1))]))
-    assert distributed.computed(["scipy"]) != {"scipy": digest(scipy_checks())}
+                ray_actors.refuse_other_arithmetic(0, {**found, part: "0"})
+    monkeypatch.setattr(ray_actors, "scipy_checks", lambda: iter([("qr", np.zeros(1))]))
+    assert ray_actors.computed(["scipy"]) != {"scipy": digest(scipy_checks())}
 
 
 def test_actors_close_their_environments_where_a_run_ends(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import signal
 import subprocess
 import threading
@@ -113,26 +112,25 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
         begun.clear()
 
 
-def test_rays_of_our_own_start_one_at_a_time(
-    cluster_class: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("cluster_class")
+def test_rays_of_our_own_start_one_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from space_dist.errors import Interrupted
+    from space_dist.run import ray_session
 
-    module = importlib.import_module(cluster_class.__module__)
     order = []
 
     def other() -> None:
-        with module._turn_to_start(lambda: None):
+        with ray_session._turn_to_start(lambda: None):
             order.append("other")
 
     thread = threading.Thread(target=other)
-    with module._turn_to_start(lambda: None):
+    with ray_session._turn_to_start(lambda: None):
         thread.start()
         time.sleep(0.5)
         order.append("first")
     thread.join()
     assert order == ["first", "other"]
-    with module._turn_to_start(lambda: None):
+    with ray_session._turn_to_start(lambda: None):
         (tmp_path / "stop").touch()
         stop = StopRequests()
         stop.watch(tmp_path / "stop", 1.0)
@@ -141,10 +139,10 @@ def test_rays_of_our_own_start_one_at_a_time(
             if reason := stop.reason():
                 raise Interrupted(reason)
 
-        with pytest.raises(Interrupted), module._turn_to_start(raise_if_stopped):  # who waits hears a stop
+        with pytest.raises(Interrupted), ray_session._turn_to_start(raise_if_stopped):  # who waits hears a stop
             pass
-        monkeypatch.setattr(module, "_TURN_SECONDS", 0.3)
-        with module._turn_to_start(lambda: None):  # one that never ends holds nobody up
+        monkeypatch.setattr(ray_session, "_TURN_SECONDS", 0.3)
+        with ray_session._turn_to_start(lambda: None):  # one that never ends holds nobody up
             pass
 
 

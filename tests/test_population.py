@@ -13,14 +13,13 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from space_dist import rollout
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.curricula.making import make_curriculum
 from space_dist.envs.interface import Step
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.learner import CoupledLearner
 from space_dist.ledger import CURRICULUM, Ledger
-from space_dist.rollout import Shard, Worker
+from space_dist.rollout import Shard, Worker, collecting
 from space_dist.rollout.policy import policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import learner_of, make_setup, memory_of, spec_of
@@ -93,8 +92,8 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
 
 def test_members_that_stay_together_play_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     configs = [configured(tmp_path / str(number), number) for number in range(3)]
-    played, replayed = [], rollout.replayed
-    monkeypatch.setattr(rollout, "replayed", lambda env, table: played.append(1) or replayed(env, table))
+    played, replayed = [], collecting.replayed
+    monkeypatch.setattr(collecting, "replayed", lambda env, table: played.append(1) or replayed(env, table))
     together(configs, [tmp_path / f"run{number}" for number in range(3)])
     assert len(played) == 1  # the first round's, of nothing
 

@@ -19,7 +19,8 @@ from space_dist.envs import make_batched
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner import OnPolicyLearner, Update
 from space_dist.learner.population import PopulationLearner, learn_together, refuse, stack_key
-from space_dist.learner.stacked import PPO, Adam, Stack
+from space_dist.learner.stack import Adam, Stack
+from space_dist.learner.stacked import PPO
 from space_dist.learner.trust_region import TRPO
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard

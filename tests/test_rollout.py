@@ -23,7 +23,6 @@ from space_dist.errors import SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.learner import make_learner
 from space_dist.rollout import (
-    CHUNK,
     Outcomes,
     Rollout,
     Setup,
@@ -36,6 +35,7 @@ from space_dist.rollout import (
     joined,
 )
 from space_dist.rollout.policy import Actions, Head, MlpPolicy, Noise, Statistics, forward, from_arrays, to_arrays
+from space_dist.rollout.setup import CHUNK
 from space_dist.rollout.walk import Walk
 from space_dist.seeding import Purpose, episode_seeds, generator
 from tests import tiny_env
@@ -523,7 +523,7 @@ def lines(n: int, **changes: Any) -> Setup:
 
 
 def test_start_values_are_means_over_seeded_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("space_dist.rollout.CHUNK", 4096)  # a smaller one, or starts alone would take seconds
+    monkeypatch.setattr("space_dist.rollout.setup.CHUNK", 4096)  # a smaller one, or starts alone would take seconds
     size, n = 4, 10
     setup = lines(n, start_states=1000)
     assert (setup.chunk_size, setup.chunks) == (size, 3)

@@ -43,8 +43,8 @@ from space_dist.run.building import learner_of, spec_of
 from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.run.launch import begun
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
-from space_dist.sb3.callback import STATE
 from space_dist.sb3.script import Scored, Wrapped
+from space_dist.sb3.session import STATE
 from space_dist.system.interrupts import StopRequests
 from tests.faulty_env import Honest
 from tests.patience import PATIENCE
@@ -220,7 +220,7 @@ def test_every_curriculums_decisions_are_our_loops(name: str, tmp_path: Path, mo
         def probed(session: Any, seen: Any) -> list[Outcomes]:  # noqa: ARG001
             return witness.probed.get(session.state.version, [])
 
-        monkeypatch.setattr("space_dist.sb3.callback._Session._probed", probed)
+        monkeypatch.setattr("space_dist.sb3.session.Session._probed", probed)
     replay(config, witness, callback)
     assert callback.selection.version >= 3
 

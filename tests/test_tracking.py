@@ -25,8 +25,7 @@ from mlflow.entities import Run
 from space_dist.errors import ConfigError
 from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
 from space_dist.report import figures
-from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, answers, follow, sync
-from space_dist.tracking import runs as tracked_runs
+from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, answers, follow, store, sync
 from space_dist.tracking.pusher import ended_within
 from tests.patience import PATIENCE
 from tests.test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
@@ -154,7 +153,7 @@ def test_more_rows_than_one_call_takes(uri: str, tmp_path: Path) -> None:
 def test_a_death_after_any_call_is_made_good(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Die right after the 1st, 2nd, ... call that writes, until one push survives; then everything must be there."""
     ledger = start_run(tmp_path / "run")
-    monkeypatch.setattr(tracked_runs, "_MAX_METRICS", 100)
+    monkeypatch.setattr(store, "_MAX_METRICS", 100)
     monkeypatch.setattr(figures, "png", lambda figure: b"a picture")  # drawing takes most of the time
     continue_run(ledger, [float(n) for n in range(7)], [[0]] * 6)  # two calls' worth of metrics
     sync([ledger], uri, "reference")

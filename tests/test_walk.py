@@ -18,7 +18,6 @@ from sb3_contrib import TRPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from space_dist import rollout as rollouts_module
 from space_dist.config import A2CConfig, PPOConfig, TRPOConfig
 from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, BatchedSingles, make_batched
@@ -27,7 +26,7 @@ from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.learner import make_learner
 from space_dist.learner.normaliser import _discounted
-from space_dist.rollout import Rollout, Setup, Shard, Stage, Worker, collect
+from space_dist.rollout import Rollout, Setup, Shard, Stage, Worker, collect, collecting
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.seeding import Purpose, generator
 from tests.test_learner import Ignore
@@ -81,7 +80,7 @@ def test_whoever_goes_on_with_an_episode_gives_the_same_bits(monkeypatch: pytest
     assert same(lambda *_: Worker(one))
     pair = Worker(one), Worker(one)
     assert same(lambda at, shard: pair[(at + shard) % 2])
-    monkeypatch.setattr(rollouts_module, "LIVE", 1)
+    monkeypatch.setattr("space_dist.rollout.worker.LIVE", 1)
     crowded = Worker(one)
     assert same(lambda *_: crowded)
     assert len(crowded._stages) == 2
@@ -90,8 +89,8 @@ def test_whoever_goes_on_with_an_episode_gives_the_same_bits(monkeypatch: pytest
 def test_going_on_at_once_plays_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
     one = setup()
     worker, played = Worker(one), []
-    replayed = rollouts_module.replayed
-    monkeypatch.setattr(rollouts_module, "replayed", lambda env, table: played.append(1) or replayed(env, table))
+    replayed = collecting.replayed
+    monkeypatch.setattr(collecting, "replayed", lambda env, table: played.append(1) or replayed(env, table))
     going_on(one, lambda *_: worker, rounds=5)
     assert len(played) == one.shards  # the first round's, of nothing
 

@@ -18,7 +18,8 @@ from rich.console import Console
 from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
 from space_dist.kernels.lanes import product
 from space_dist.kernels.ppo import N_RECORDED
-from space_dist.learner.stacked import PPO, PPOSettings, Samples, Stack
+from space_dist.learner.stack import Stack
+from space_dist.learner.stacked import PPO, PPOSettings, Samples
 
 console = Console()
 MEMBERS, MINIBATCHES = 16, 8  # members of a stack; minibatches that are timed together

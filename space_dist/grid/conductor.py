@@ -13,7 +13,6 @@ import dataclasses
 import logging
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,10 +25,9 @@ from space_dist.experiment.endings import Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import Attempts, RunStatus, concluded, may_retry, run_status_of, run_statuses, unheard
 from space_dist.ledger import Lock
-from space_dist.system.files import appending, in_words, locked
-from space_dist.system.importing import PYTHON
+from space_dist.system.files import in_words, locked
 from space_dist.system.provenance import code_digest
-from space_dist.tracking.pusher import ended_within
+from space_dist.tracking.pusher import Pusher
 
 log = logging.getLogger("space_dist")
 
@@ -305,15 +303,13 @@ def working_on(
     pusher = None
     try:
         grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
-        pusher = _start_pusher(grid, manifest)
+        if manifest.tracking.uri is not None:
+            pusher = Pusher(manifest.tracking.uri, grid.folder, grid.tracking_log)
         yield
     finally:
         lock.release()  # by which the pusher knows that it may end
-        if pusher is not None and not ended_within(pusher, _FINAL_PUSH_SECONDS):
-            say(
-                f"warning: MLflow at {manifest.tracking.uri} could not be brought up to date; nothing is lost: "
-                f"`space-dist sync {grid.folder}` replays the grid (details: {grid.tracking_log})"
-            )
+        if pusher is not None and (warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid")):
+            say(f"warning: {warning}")
 
 
 def _acquired(
@@ -336,14 +332,3 @@ def _acquired(
             raise LedgerError(f"cannot write the grid's folder {grid.folder}: {in_words(error)}") from None
         else:
             return lock
-
-
-def _start_pusher(grid: Grid, manifest: Manifest) -> subprocess.Popen[bytes] | None:
-    """One process pushes for all runs, so that a store has one writer, and a slow server costs no training time."""
-    if manifest.tracking.uri is None:
-        return None
-    command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(grid.folder)]
-    with appending(grid.tracking_log) as output:
-        return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
-        )  # fmt: skip

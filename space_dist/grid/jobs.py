@@ -36,7 +36,7 @@ from space_dist.grid.conductor import Conductor, Overview
 from space_dist.grid.pool import Nonce, Pool
 from space_dist.grid.supervisor import AttemptId, ray_answers
 from space_dist.grid.warm import cores, slurms_memory_of_a_core
-from space_dist.run.ray_cluster import attended, join_ray, remove_session
+from space_dist.run.ray_session import attended, join_ray, remove_session
 from space_dist.system.importing import PYTHON
 
 log = logging.getLogger("space_dist")

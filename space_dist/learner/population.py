@@ -23,9 +23,11 @@ from space_dist.config import LearnerConfig, PPOConfig, TRPOConfig, learners_tha
 from space_dist.envs.observations import concatenate
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.kernels import Shape
+from space_dist.learner.heads import evaluate
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
 from space_dist.learner.on_policy import Joined, OnPolicyLearner
-from space_dist.learner.stacked import ACTOR, PPO, ROWS, Layout, PPOSettings, Report, Samples, Stack, rounded_up
+from space_dist.learner.stack import ACTOR, ROWS, Layout, Stack, rounded_up
+from space_dist.learner.stacked import PPO, PPOSettings, Report, Samples
 from space_dist.learner.trust_region import TRPO, TRPOSettings
 from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
@@ -350,7 +352,7 @@ def _evaluated(
         observations[member, count : count + len(more)] = more
         actions[member, :count] = _flat(one.actions).reshape(count, -1)
     seen, done = (torch.from_numpy(array).to(stack.device) for array in (observations, actions))
-    values, log_probs = stack.evaluate(seen, done, rows)
+    values, log_probs = evaluate(stack, seen, done, rows)
     collected = _advantages_of(members, rounds, joined, values.cpu().numpy())
 
     def together(arrays: Sequence[Array]) -> torch.Tensor:

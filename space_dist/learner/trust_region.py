@@ -18,20 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from space_dist.learner.stacked import (
-    ACTOR,
-    CRITIC,
-    Adam,
-    Minibatches,
-    Networks,
-    Report,
-    Samples,
-    Stack,
-    column,
-    head_of,
-    parts_of,
-    split,
-)
+from space_dist.learner.heads import head_of
+from space_dist.learner.stack import ACTOR, CRITIC, Adam, Networks, Stack, column, split
+from space_dist.learner.stacked import Minibatches, Report, Samples, parts_of
 
 _RESIDUAL = 1e-10  # of conjugate gradients, squared, below which they stop; sb3-contrib
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.curricula import Selection
 from space_dist.errors import SpaceDistError
+from space_dist.seeding import Purpose, episode_seeds
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -81,6 +82,62 @@ class Walk:
             for shard, count in enumerate(begun)
         )
         return Walk(selection.order_version, positions, tuple(unfinished))
+
+
+class Route(Protocol):
+    """Which episodes the slots of a shard go on with in a round, and which they begin: `selection`, from `start`."""
+
+    @property
+    def selection(self) -> Selection:
+        """What is walked."""
+
+    @property
+    def start(self) -> int:
+        """The place in `selection` of the next episode."""
+
+    @property
+    def gamma(self) -> float:
+        """Discount per step."""
+
+    @property
+    def seed(self) -> int:
+        """The run's; with `round` and `shard` it decides the episodes' own."""
+
+    @property
+    def round(self) -> int:
+        """Of the run, from 0."""
+
+    @property
+    def shard(self) -> int:
+        """Of the round, from 0."""
+
+    @property
+    def unfinished(self) -> Unfinished | None:
+        """What runs in the slots; None: nothing."""
+
+
+class Walking:
+    """Which instance, with which seed, each slot's next episode has, over several rollouts of `slots` slots each."""
+
+    def __init__(self, rollouts: Sequence[Route], slots: int, length: int) -> None:
+        self._slots = slots
+        self.begun = np.zeros(len(rollouts), dtype=np.int64)  # episodes
+        self._starts = np.array([rollout.start for rollout in rollouts])
+        self._sizes = np.array([len(rollout.selection.ids) for rollout in rollouts])
+        self._firsts = np.cumsum(self._sizes) - self._sizes  # of each rollout's instances among all
+        self._ids = np.concatenate([rollout.selection.ids for rollout in rollouts])
+        self._contexts = np.concatenate([rollout.selection.contexts for rollout in rollouts])
+        self._seeds = np.stack([
+            episode_seeds(one.seed, Purpose.EPISODES, one.round, one.shard, count=slots * length) for one in rollouts
+        ])  # fmt: skip
+
+    def next(self, slots: IntArray) -> tuple[IntArray, FloatArray, NDArray[np.uint64]]:
+        """(k,) ids, (k, d) contexts and (k,) seeds of the episodes that begin in `slots` (k,), which ascend."""
+        owners = slots // self._slots
+        numbers = self.begun[owners] + np.arange(len(slots)) - np.searchsorted(owners, owners)
+        self.begun += np.bincount(owners, minlength=len(self.begun))
+        places = self._firsts[owners] + (self._starts[owners] + numbers) % self._sizes[owners]
+        return self._ids[places], self._contexts[places], self._seeds[owners, numbers]
 
 
 def stacked(walk: Walk) -> dict[str, NDArray[Any]]:

@@ -10,7 +10,6 @@ import itertools
 import json
 import logging
 import os
-import subprocess
 import sys
 import time
 import traceback
@@ -46,12 +45,11 @@ from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import make_setup, policy_in, resolved, spec_of
 from space_dist.run.cluster import Cluster, InProcess
 from space_dist.run.training import Progress, Training
-from space_dist.system.files import LogFile, appending, in_words
-from space_dist.system.importing import PYTHON
+from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import fingerprint
 from space_dist.system.workplace import absolute_uri, private_ray
-from space_dist.tracking.pusher import ended_within
+from space_dist.tracking.pusher import Pusher
 
 log = logging.getLogger("space_dist")
 
@@ -112,7 +110,7 @@ class ActiveRun:
     status: Status
     stop: StopRequests
     outcome: Outcome
-    pusher: subprocess.Popen[bytes] | None = None
+    pusher: Pusher | None = None
 
     def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
@@ -133,7 +131,8 @@ class ActiveRun:
 
     def finished(self) -> Outcome:
         """How it ended, once MLflow's mirror has what it can have."""
-        return replace(self.outcome, tracking_warning=_final_push(self.config, self.outcome.ledger, self.pusher))
+        warning = None if self.pusher is None else self.pusher.warning(_FINAL_PUSH_SECONDS, "run")
+        return replace(self.outcome, tracking_warning=warning)
 
 
 @contextlib.contextmanager
@@ -472,30 +471,13 @@ def _logging_to(path: Path) -> Iterator[None]:
         handler.close()
 
 
-def _start_pusher(config: RunConfig, ledger: Ledger) -> subprocess.Popen[bytes] | None:
-    """MLflow's mirror is kept by a process of its own: a slow or dead server costs training nothing."""
+def _start_pusher(config: RunConfig, ledger: Ledger) -> Pusher | None:
     if config.tracking.uri is None or not config.tracking.live:
         return None
-    command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(ledger.folder)]
     try:
-        with appending(ledger.folder / "tracking.log") as output:
-            # A session of its own: Ctrl-C is for the run; the pusher ends by itself once the run has.
-            return subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
-            )  # fmt: skip
+        return Pusher(config.tracking.uri, ledger.folder, ledger.folder / "tracking.log")
     except OSError as error:
         log.warning(
             "nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", in_words(error)
         )
         return None
-
-
-def _final_push(config: RunConfig, ledger: Ledger, pusher: subprocess.Popen[bytes] | None) -> str | None:
-    if pusher is None:
-        return None
-    if ended_within(pusher, _FINAL_PUSH_SECONDS):
-        return None
-    return (
-        f"MLflow at {config.tracking.uri} could not be brought up to date; nothing is lost: "
-        f"`space-dist sync {ledger.folder}` replays the run (details: {ledger.folder / 'tracking.log'})"
-    )

@@ -1,4 +1,4 @@
-"""The same work on Ray actors: thin shells around `rollout.Worker` and `cluster.Central`.
+"""The same work on the actors of `ray_actors`: who is asked, what is owed, and what becomes of either when one dies.
 
 Nothing here decides a result. A shard may be computed by any actor; values flow from rollout actors to the curriculum
 actor, and its selection back to them, by object reference, without passing through the driver.
@@ -11,16 +11,12 @@ actors that are up; one that is being replaced joins when it is.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import logging
 import os
-import shutil
-import socket
 import statistics
-import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -29,120 +25,37 @@ from space_dist.system.workplace import RAY_DEFAULTS
 
 os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
-import psutil
 import ray
 from ray.exceptions import RayError, RayTaskError
-from ray.job_config import JobConfig
 from ray.util.placement_group import PlacementGroup, placement_group, placement_group_table, remove_placement_group
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
-from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import digest, numpy_digest, scipy_checks
 from space_dist.arithmetic import settings as arithmetic_settings
 from space_dist.config import RunConfig
-from space_dist.envs import BULLET_IDS
-from space_dist.errors import ConfigError, Interrupted, SpaceDistError, exits_refused
-from space_dist.rollout import FloatArray, IntArray, Setup, Split, Worker
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.rollout import FloatArray, IntArray, Setup, Split
 from space_dist.rollout.walk import Walk
-from space_dist.run.cluster import Central, Decision, Evidence, Handle
-from space_dist.run.ray_watch import (
-    JOIN_SECONDS,
-    SILENT_SECONDS,
-    START_SECONDS,
-    Note,
-    Started,
-    bounded,
-    nowhere,
-    parts,
-    reach,
-    watched,
+from space_dist.run.cluster import Decision, Evidence, Handle
+from space_dist.run.ray_actors import (
+    CENTRAL,
+    CurriculumActor,
+    RolloutActor,
+    computes_with,
+    name_of,
+    refuse_other_arithmetic,
 )
-from space_dist.system.importing import folders_of_user, look_in
+from space_dist.run.ray_session import attended, cpus, first_line, join_ray, remove_session, shut_down
+from space_dist.run.ray_watch import Note, nowhere
+from space_dist.system.importing import folders_of_user
 
-_OBJECT_STORE_BYTES = 256 << 20
-_STARTS = 5  # of a Ray of our own
-_TURN_SECONDS = 300.0  # that one waits for others to be up
 _ATTEMPTS = 6  # at one call, or at one actor's start, before something must be wrong with the work itself
 _LOOK_SECONDS = 0.2  # between two looks for what died or is late
 _RESCHEDULING_SECONDS = 5.0  # that Ray gets to find other room for a lost node's actors
-_REMEMBERED = 101  # durations per kind of call, whose median says what is late
+_REMEMBERED = 101  # durations per kind of call, whose median says what is late: a mean would follow the late ones
 _CLOSING_SECONDS = 5.0  # that actors get to close their environments
-_CENTRAL = -1
 _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 
 log = logging.getLogger("space_dist")
-
-
-def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[str, ...]:
-    """What decides the bits that an actor computes, as `computed` knows it, beside those of the environment itself."""
-    if central:
-        return ("numpy", *config.curriculum.libraries)
-    from space_dist.learner import is_mlp  # torch, which actors of such policies never import
-
-    also = {"torch": not is_mlp(config.learner, setup.spec.observation_space),
-            "pybullet": config.env.id in BULLET_IDS}  # fmt: skip
-    return ("numpy", *(name for name, used in also.items() if used))
-
-
-def computed(parts: Iterable[str]) -> dict[str, str]:
-    """By part, a digest of what this process computes with it; of libraries without kernels of their own, the version.
-
-    NumPy's, which is of the system's libm as well, takes some milliseconds, as do SciPy's and torch's once imported.
-    """
-    found = {}
-    for part in parts:
-        if part == "numpy":
-            found[part] = numpy_digest()
-        elif part == "scipy":
-            found[part] = digest(scipy_checks())
-        elif part == "torch":
-            from space_dist.learner import torch_checks  # likewise
-
-            found[part] = digest(torch_checks())
-        else:
-            found[part] = importlib.metadata.version(part)
-    return found
-
-
-class _Timed:
-    """An actor's side of a call: what it answers, and how long that took."""
-
-    def ready(self, parts: Sequence[str]) -> dict[str, str]:
-        """Answers once the actor is up: with what its arithmetic computes, as `computed` says."""
-        return computed(parts)
-
-    def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
-        """Seconds, and the answer: one object, or each of `several`."""
-        start = time.monotonic()
-        with exits_refused():  # which Ray would take for the actor's own wish, and the driver for a loss
-            answer = getattr(self, method)(*arguments, **options)
-        seconds = time.monotonic() - start
-        return (seconds, *answer) if several else (seconds, answer)
-
-
-class RolloutActor(_Timed, Worker):
-    """A `Worker` in a process of its own, with one thread for its arithmetic.
-
-    folders: where a user's own modules may be found.
-    """
-
-    def __init__(self, setup: Setup, folders: Sequence[str]) -> None:
-        look_in(folders)
-        threadpool_limits(limits=1)
-        super().__init__(setup)
-        self.make_first()
-
-
-class CurriculumActor(_Timed, Central):
-    """The central curriculum: aggregates the start values that all rollout actors send it, and decides.
-
-    folders: as `RolloutActor`'s.
-    """
-
-    def __init__(self, config: RunConfig, setup: Setup, folders: Sequence[str]) -> None:
-        look_in(folders)
-        threadpool_limits(limits=1)
-        super().__init__(config, setup.train, setup.spec.context_bounds)
 
 
 @dataclass(eq=False)
@@ -161,7 +74,7 @@ class _RemoteValue:
 class _Call:
     """A call of an actor's method, kept until its answer has arrived so that it can be made again."""
 
-    work: int  # number of the shard, chunk or part, which decides the actor; _CENTRAL for the curriculum actor
+    work: int  # number of the shard, chunk or part, which decides the actor; CENTRAL for the curriculum actor
     method: str
     arguments: tuple[Any, ...]
     options: dict[str, Any]
@@ -211,12 +124,12 @@ class RayCluster:
         resources = self._resources
         found = join_ray(resources.address, resources.workers + 1, self._raise_if_stopped, self._note)
         self._session = found["session_dir"] if resources.address == "local" else None
-        self._watch.enter_context(attended(found, resources.address, gone=True, leave=_shut_down, note=self._note))
+        self._watch.enter_context(attended(found, resources.address, gone=True, leave=shut_down, note=self._note))
         try:
             self._remote_setup = self.put(self._setup)
             if not self._take_room(resources.workers, resources.room_seconds):
                 raise self._no_room(resources.workers)
-            self._start((*range(resources.workers), _CENTRAL))
+            self._start((*range(resources.workers), CENTRAL))
             while self._starting:
                 self._look_after_starting()
         except BaseException:
@@ -270,18 +183,18 @@ class RayCluster:
 
     def begin(self, values: Sequence[Handle]) -> Decision:
         """See `cluster.Cluster`."""
-        return Decision(*self._ask(_CENTRAL, "begin", *values))
+        return Decision(*self._ask(CENTRAL, "begin", *values))
 
     def decide(
         self, state: Handle, before: Handle, evidence: Evidence, *, version: int, gradient_steps: int
     ) -> Decision:
         """See `cluster.Cluster`."""
         layout, handles = evidence.flat()
-        return Decision(*self._ask(_CENTRAL, "decide", state, before, version, gradient_steps, layout, *handles))
+        return Decision(*self._ask(CENTRAL, "decide", state, before, version, gradient_steps, layout, *handles))
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values; every call made so far is answered then. Raises SpaceDistError if work fails repeatedly."""
-        decided = [remote for call in self._unanswered if call.work == _CENTRAL for remote in call.answers]
+        decided = [remote for call in self._unanswered if call.work == CENTRAL for remote in call.answers]
         wanted = [remote for remote in dict.fromkeys([*handles, *decided]) if not remote.kept]
         while True:
             self._wait_for_answers()
@@ -303,14 +216,14 @@ class RayCluster:
     # ---- calls ----
 
     def _ask(self, work: int, method: str, *arguments: Any, **options: Any) -> list[_RemoteValue]:
-        answers = [_RemoteValue(None) for _ in range(_CENTRAL_ANSWERS if remote == _CENTRAL else 1)]
+        answers = [_RemoteValue(None) for _ in range(_CENTRAL_ANSWERS if work == CENTRAL else 1)]
         call = _Call(work, method, arguments, options, answers)
         self._unanswered.append(call)
         self._submit(call)
         return answers
 
     def _submit(self, call: _Call) -> None:
-        call.actor_index = _CENTRAL if call.work == _CENTRAL else self._actor_for(call.work)
+        call.actor_index = CENTRAL if call.work == CENTRAL else self._actor_for(call.work)
         call.actor, call.since, call.answered = self._actors[call.actor_index], None, False
         call.number = self._submitted = self._submitted + 1
         several = len(call.answers) > 1
@@ -369,7 +282,7 @@ class RayCluster:
             elif self._clock - call.since > self._patience(call):
                 log.warning(
                     "%s has not answered for %.0f s where %s takes %.2g s; replacing it",
-                    _name(index), self._clock - call.since, call.method, self._usual_seconds(call),
+                    name_of(index), self._clock - call.since, call.method, self._usual_seconds(call),
                 )  # fmt: skip
                 call.late += 1
                 late.add(index)
@@ -397,7 +310,7 @@ class RayCluster:
             if call in lost or owed or (not call.answered and not moved.isdisjoint(call.remote_arguments)):
                 call.attempts += 1
                 if call.attempts == _ATTEMPTS:
-                    what = "took too long" if reason is None else f"{type(reason).__name__}: {_first_line(reason)}"
+                    what = "took too long" if reason is None else f"{type(reason).__name__}: {first_line(reason)}"
                     raise SpaceDistError(
                         f"the same work was lost {_ATTEMPTS} times ({what}). What was committed is intact; "
                         "--resume continues"
@@ -409,7 +322,7 @@ class RayCluster:
 
     def _actor_for(self, work: int) -> int:
         """The rollout actor for a part of the work: the same one as long as none is lost."""
-        while not (indices := sorted(index for index in self._actors if index not in (_CENTRAL, *self._starting))):
+        while not (indices := sorted(index for index in self._actors if index not in (CENTRAL, *self._starting))):
             self._find_other_room()
         return indices[work % len(indices)]
 
@@ -426,17 +339,17 @@ class RayCluster:
             setup = self._remote_setup.ref
             self._actors[index] = (
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup, folders_of_user())
-                if index == _CENTRAL
+                if index == CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
-            parts = self._computing[index == _CENTRAL]
+            parts = self._computing[index == CENTRAL]
             self._starting[index] = (self._actors[index].ready.remote(parts), time.monotonic())
 
     def _close_environments(self) -> None:
         """Have actors close their environments: what these hold outside of their process would outlive it."""
         with contextlib.suppress(RayError):
             asked = [actor.close.remote() for index, actor in self._actors.items()
-                     if index != _CENTRAL and index not in self._starting]  # fmt: skip
+                     if index != CENTRAL and index not in self._starting]  # fmt: skip
             if asked:
                 ray.wait(asked, num_returns=len(asked), timeout=_CLOSING_SECONDS, fetch_local=False)
 
@@ -463,7 +376,7 @@ class RayCluster:
                     del self._starting[index]
                     self._failed_starts[index] = 0
             elif time.monotonic() - since > self._resources.first_answer_seconds:
-                log.warning("%s did not start; trying again", _name(index))
+                log.warning("%s did not start; trying again", name_of(index))
                 self._retry_start(index, None)
 
     def _retry_start(self, index: int, error: RayError | None) -> None:
@@ -474,8 +387,8 @@ class RayCluster:
         if isinstance(cause, RayTaskError) and not _is_loss(cause):  # its environment's or policy's own fault
             raise _cause(cause) from error
         if self._failed_starts[index] == _ATTEMPTS:
-            what = "no sign of life" if error is None else _first_line(error)
-            raise SpaceDistError(f"{_name(index)} died as it started: {what}") from error
+            what = "no sign of life" if error is None else first_line(error)
+            raise SpaceDistError(f"{name_of(index)} died as it started: {what}") from error
         if error is not None:
             self._remote_setup.ref = ray.put(self._setup)  # it may be what was lost
         self._replace([index])
@@ -498,7 +411,7 @@ class RayCluster:
     def _find_other_room(self) -> None:
         """Wait for a rollout actor to come up; if Ray finds no room for all of them any more, hold what there is."""
         start, seconds = time.monotonic(), self._resources.room_seconds
-        while self._actors.keys() - {_CENTRAL} <= self._starting.keys():
+        while self._actors.keys() - {CENTRAL} <= self._starting.keys():
             self._look_after_starting()
             waited = time.monotonic() - start
             if waited > min(_RESCHEDULING_SECONDS, seconds) and not self._has_room():
@@ -507,159 +420,24 @@ class RayCluster:
                         ray.kill(actor)
                 self._actors, self._starting = {}, {}
                 self._leave_room()
-                workers = max(1, min(self._resources.workers, int(_cpus()[1])))
+                workers = max(1, min(self._resources.workers, int(cpus()[1])))
                 if not self._take_room(workers, _RESCHEDULING_SECONDS):
                     if waited > seconds:
                         raise self._no_room(workers)
                     continue
                 log.warning("room is left for %d of %d rollout actors", workers, self._resources.workers)
-                self._start((*range(workers), _CENTRAL))
+                self._start((*range(workers), CENTRAL))
 
     def _has_room(self) -> bool:
         return self._room is not None and placement_group_table(self._room)["state"] == "CREATED"
 
     def _no_room(self, workers: int) -> SpaceDistError:
-        total, free = _cpus()
+        total, free = cpus()
         return SpaceDistError(
             f"Ray has no room for {workers} rollout actors of one CPU each: in {self._resources.room_seconds:.0f} s "
             f"(resources.room_seconds) none was found; the cluster has {total:.0f} CPUs, {free:.0f} of them free. "
             "Fewer fit with --workers"
         )
-
-
-class _Driver(JobConfig):
-    """What Ray tells workers of their driver, but for its folders, where they would look before anywhere else."""
-
-    def _serialize(self) -> str:
-        self._py_driver_sys_path: list[str] = []
-        return super()._serialize()
-
-
-def join_ray(
-    address: str, cpus: int, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
-) -> dict[str, Any]:  # fmt: skip
-    """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
-
-    A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
-    not enough on a busy machine. While that lasts, `raise_if_stopped` is called, and may raise what ends it. Raises SpaceDistError
-    if Ray cannot be started or reached; where it takes our call and does not return, the process ends with that, and
-    `note` is told.
-    """
-    where = f"at {address!r} (resources.address, or --address)"
-    ours = address == "local"
-    options: dict[str, Any] = (
-        {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES} if ours else {}
-    )
-    failures, most = 0, START_SECONDS if ours else JOIN_SECONDS
-    late = f"Ray cannot be started or reached {where}: it did not come up in {most:.0f} s"
-    while True:
-        before, started = set(psutil.Process().children()), Started() if ours else None
-        raise_if_stopped()
-        try:
-            if not ours:
-                reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, raise_if_stopped)
-            with (
-                _turn_to_start(raise_if_stopped) if ours else contextlib.nullcontext(),
-                bounded(most, late, started, note=note),
-            ):
-                context = ray.init(
-                    address=address, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False,
-                    job_config=_Driver(), **options,
-                )  # fmt: skip
-        except Interrupted:
-            raise
-        except Exception as error:  # Ray raises bare ones, too
-            failures += 1
-            what = _first_line(error)
-            if not ours or failures == _STARTS:
-                raise SpaceDistError(f"Ray cannot be started or reached {where}: {what}") from error
-            log.warning("Ray did not start (%s); trying again", what)
-            ray.shutdown()
-            for process in set(psutil.Process().children()) - before:  # halves of a Ray
-                with contextlib.suppress(psutil.Error):
-                    process.kill()
-        else:
-            found: dict[str, Any] = context.address_info  # type: ignore[attr-defined]
-            return {**found, "started": started}
-
-
-@contextlib.contextmanager
-def attended(
-    found: Mapping[str, Any], address: str, *, gone: bool, leave: Callable[[], None], note: Note = nowhere
-) -> Iterator[None]:  # fmt: skip
-    """Watch the Ray that `join_ray` `found` at `address`; see `ray_watch.watched`. Afterwards none of ours is left.
-
-    leave: shuts down or disconnects, once nobody watches any more: what ends on purpose has not died.
-    """
-    started: Started | None = found["started"]
-    where = "of our own" if started else f"at {address!r} (resources.address, or --address)"
-    addresses = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
-    if started is not None:
-        started.look()
-    try:
-        with watched(addresses, where, started, gone=gone, note=note):
-            yield
-    finally:
-        late = f"the Ray {where} did not shut down in {SILENT_SECONDS:.0f} s. What was committed is intact"
-        with bounded(SILENT_SECONDS, late, started, Interrupted.exit_code, note):
-            leave()
-        if started is not None:
-            started.end()
-
-
-@contextlib.contextmanager
-def _turn_to_start(raise_if_stopped: Callable[[], None]) -> Iterator[None]:
-    """Wait for other Rays of ours on this machine to be up: together, nine processes each, all would be too slow.
-
-    An abstract socket is held, which is nobody's file, and free again whatever becomes of its holder.
-    """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as turn:
-        until = time.monotonic() + _TURN_SECONDS
-        while sys.platform == "linux" and time.monotonic() < until:
-            try:
-                turn.bind(f"\0space_dist starts a Ray for {os.getuid()}")
-                break
-            except OSError:
-                raise_if_stopped()
-                time.sleep(_LOOK_SECONDS)
-        yield
-
-
-def _shut_down() -> None:
-    ray.shutdown()
-
-
-def remove_session(folder: str | None) -> None:
-    """Remove what a Ray of our own has left of its sockets and logs: Ray itself never does."""
-    if folder is not None:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def refuse_other_arithmetic(index: int, found: Mapping[str, str]) -> None:
-    """Raise SpaceDistError for an actor whose results, `found` by part, would depend on its being there."""
-    here = computed(found)
-    other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
-    if other:
-        raise SpaceDistError(
-            f"{_name(index)} computes other bits than this process with {', '.join(other)}: its node has another "
-            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
-            "nodes of one kind (resources.address, or the cluster's own constraints)"
-        )
-
-
-def _name(index: int) -> str:
-    return "the curriculum actor" if index == _CENTRAL else f"rollout actor {index}"
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
-
-
-def _cpus() -> tuple[float, float]:
-    """CPUs of the cluster: all, and free ones."""
-    total: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-    free: dict[str, float] = ray.available_resources()  # type: ignore[no-untyped-call]
-    return total.get("CPU", 0.0), free.get("CPU", 0.0)
 
 
 def _is_loss(error: BaseException | None) -> bool:

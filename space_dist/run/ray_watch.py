@@ -35,6 +35,7 @@ _PAUSE_SECONDS = 2.0
 _LOOK_SECONDS = 10.0  # between two looks at which processes a Ray of our own has
 _NOTE_SECONDS = 5.0  # that it may take to note why the process ends
 _END_SECONDS = 5.0  # that Ray's own processes get to end by themselves
+# A client's preface and an empty SETTINGS frame: RFC 9113, sections 3.4 and 6.5.
 _GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\x00\x00\x00\x04\x00\x00\x00\x00\x00"
 
 Note = Callable[[str, int], None]

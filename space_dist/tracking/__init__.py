@@ -24,15 +24,14 @@ from space_dist.errors import LedgerError
 from space_dist.experiment.manifest import CELL_ID_DIGITS, MANIFEST, Grid
 from space_dist.ledger import Ledger, Status
 from space_dist.tracking.grids import GridMirror
-from space_dist.tracking.runs import (
+from space_dist.tracking.snapshot import NOTE_TAG, read_snapshot
+from space_dist.tracking.store import (
     GRID_TAG,
-    NOTE_TAG,
     ROWS_TAG,
     RUN_TAG,
     RefusedError,
     Store,
     TrackingError,
-    read_snapshot,
     store_errors,
     usable_uri,
 )

@@ -24,22 +24,17 @@ from space_dist.experiment.manifest import Cell, Grid, Manifest, Run
 from space_dist.experiment.status import Attempts, History, RunStatus, run_status_of
 from space_dist.ledger import METRICS, Ledger, Row, Status, decode_row
 from space_dist.system.provenance import code_digest
-from space_dist.tracking.runs import (
-    GRID_TAG,
+from space_dist.tracking.snapshot import (
     MAX_TAG,
     NOTE_TAG,
     STARTED_TAG,
-    Child,
-    Parent,
     Part,
-    RefusedError,
     Snapshot,
-    Store,
-    TrackingError,
     as_params,
     key_of,
     read_snapshot,
 )
+from space_dist.tracking.store import GRID_TAG, Child, Parent, RefusedError, Store, TrackingError
 
 log = logging.getLogger("space_dist.tracking")
 

@@ -6,9 +6,39 @@ import contextlib
 import os
 import signal
 import subprocess
-from typing import Final
+from pathlib import Path
+from typing import Final, Literal
+
+from space_dist.system.files import appending
+from space_dist.system.importing import PYTHON
 
 _KILL_SECONDS: Final = 5.0
+
+
+class Pusher:
+    """One process that pushes all there is in a folder: a store has one writer, and a slow server costs no training.
+
+    uri: of the store, for messages.  folder: a run's or a grid's.  log_file: where it writes what it says.  Raises
+    OSError if that cannot be written or no process can be started.
+    """
+
+    def __init__(self, uri: str, folder: Path, log_file: Path) -> None:
+        self._uri, self._folder, self._log_file = uri, folder, log_file
+        command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(folder)]
+        with appending(log_file) as output:
+            # A session of its own: Ctrl-C is for the work; the pusher ends by itself once whoever works has let go.
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+            )  # fmt: skip
+
+    def warning(self, seconds: float, what: Literal["run", "grid"]) -> str | None:
+        """None once it has ended well; after `seconds` it is ended, and this says what the mirror may lack."""
+        if ended_within(self._process, seconds):
+            return None
+        return (
+            f"MLflow at {self._uri} could not be brought up to date; nothing is lost: `space-dist sync {self._folder}` "
+            f"replays the {what} (details: {self._log_file})"
+        )
 
 
 def ended_within(pusher: subprocess.Popen[bytes], seconds: float) -> bool:

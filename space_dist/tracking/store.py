@@ -1,4 +1,4 @@
-"""One run into one MLflow store: what of a run is to be mirrored, and the calls that bring it there.
+"""One run into one MLflow store: the calls that bring there what `snapshot` says.
 
 `space_dist.synced_rows` says how many rows of metrics.jsonl are there. That tag is written after the rows it counts:
 what dies in between pushes some points again, and MLflow keeps a point of the same (key, time, step, value) once.
@@ -7,7 +7,6 @@ what dies in between pushes some points again, and MLflow keeps a point of the s
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import logging
 import os
@@ -15,18 +14,18 @@ import re
 import sqlite3
 import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from space_dist.config import flattened
 from space_dist.config.tracking_uri import UriError, checked_uri
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
-from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
+from space_dist.ledger import METRICS, Ledger
 from space_dist.system.files import in_words, locked
 from space_dist.system.importing import PYTHON
 from space_dist.system.workplace import absolute_uri
+from space_dist.tracking.snapshot import STARTED_TAG, Snapshot, as_params, key_of, metrics_of, tags_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -41,13 +40,10 @@ RUN_TAG: Final = "space_dist.run"
 ROWS_TAG: Final = "space_dist.synced_rows"
 ARTIFACTS_TAG: Final = "space_dist.artifacts"
 GRID_TAG: Final = "space_dist.grid_key"
-STARTED_TAG: Final = "space_dist.started"
 STAMP_TAG: Final = "space_dist.stamp"
 TABLE_TAG: Final = "space_dist.results"
-NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
 
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
-_MAX_PARAM, MAX_TAG, _MAX_KEY = 6000, 8000, 250  # characters
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
 _TURN_SECONDS: Final = 600.0  # a grid of thousands of runs takes minutes
@@ -61,178 +57,6 @@ _ENVIRONMENT: Final = {
 
 class TrackingError(SpaceDistError):
     """MLflow cannot be reached or does not take what it is sent. The ledgers are untouched."""
-
-
-# ---- a run's side ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Part:
-    """What a run is to MLflow as a part of a grid.
-
-    key: `(32 hex digits)` of grid, cell and seed. title: the child's name. remark: the end of its description.
-    tags: more of them, the parent's id among them. ending: how it stands in MLflow's words. ended_at: seconds since
-    the epoch. stamp: changes whenever anything that is pushed does; a child that has it is up to date.
-    shows_episodes: whether its policy is drawn when it is done: drawing takes seconds, so one seed of a cell is enough.
-    """
-
-    key: str
-    title: str
-    remark: str
-    tags: Mapping[str, str]
-    ending: str
-    ended_at: float
-    stamp: str
-    shows_episodes: bool
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """What of a run is to be mirrored, read before MLflow is asked anything.
-
-    started: whether its folder held a run then; of some attempts nothing is left but why they failed.
-    """
-
-    ledger: Ledger
-    status: Status
-    alive: bool
-    config: Mapping[str, Any]
-    rows: Sequence[Row]
-    timing: Sequence[Row]
-    note: str  # Markdown: what the run is, where it stands, and how it did
-    part: Part | None = None
-    started: bool = True
-
-    @property
-    def key(self) -> str:
-        """`(32 hex digits)`: this run and no other. Outside grids, also when another one starts in its folder."""
-        if self.part is not None:
-            return self.part.key
-        return key_of(str(self.ledger.folder.resolve()), repr(self.status.started_at))
-
-    @property
-    def title(self) -> str:
-        """What the run is called in MLflow."""
-        return self.part.title if self.part is not None else f"{self.status.name}-s{self.status.seed}"
-
-    @property
-    def mlflow_status(self) -> str:
-        """RUNNING, FINISHED, FAILED or KILLED."""
-        if self.part is not None:
-            return self.part.ending
-        if self.status.state == "running":
-            return "RUNNING" if self.alive else "KILLED"
-        return {"done": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}[self.status.state]
-
-    @property
-    def ended_at(self) -> float:
-        """Seconds since the epoch."""
-        return self.part.ended_at if self.part is not None else self.status.updated_at
-
-
-def key_of(*parts: str) -> str:
-    """`(32 hex digits)` by which something is found again."""
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
-
-
-def read_snapshot(
-    ledger: Ledger, status: Status, alive: bool, config: Mapping[str, Any], part: Part | None = None
-) -> Snapshot:
-    """What of a run is to be mirrored now. Raises LedgerError if its files are damaged."""
-    try:
-        rows = ledger.rows(METRICS, committed_only=True)
-        timing = ledger.rows(TIMING, committed_only=True)  # after the rows: it has one for each of them by now
-    except OSError as error:
-        raise LedgerError(f"{error.filename} cannot be read: {error.strerror}") from None
-    if len(timing) < len(rows):
-        raise LedgerError(f"{ledger.folder / TIMING} has {len(timing)} rows where {METRICS} has {len(rows)}")
-    try:
-        note = describe_run(ledger, status, config, rows)
-    except (KeyError, TypeError, ValueError) as error:
-        raise LedgerError(f"{ledger.folder / METRICS} has rows that this version cannot read: {error!r}") from None
-    if part is not None:
-        note += f"\n\n{part.remark}"
-    return Snapshot(ledger, status, alive, config, rows, timing, note, part)
-
-
-def _numbers(row: Row) -> Iterator[tuple[str, float]]:
-    """(metric name, value) of each number of a row; per-instance lists, nulls and words are none."""
-    sections = ("train", "test") if row["kind"] == "evaluation" else ("rollout", "learner", "curriculum")
-    for section in sections:
-        for name, value in row[section].items():
-            if isinstance(value, int | float):
-                yield f"{section}/{name}", float(value)
-    if row["kind"] == "iteration":
-        for name, value in row.items():
-            if isinstance(value, int | float) and name not in ("steps", "complete"):
-                yield name, float(value)
-
-
-def _metrics(snapshot: Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
-    """(rows complete once this is pushed, metric) from row `start` on, each row's own time and real step."""
-    from mlflow.entities import Metric
-
-    for index in range(start, len(snapshot.rows)):
-        row, timing = snapshot.rows[index], snapshot.timing[index]
-        try:
-            milliseconds, steps, numbers = round(timing["unix_time"] * 1000), int(row["steps"]), list(_numbers(row))
-            rate = timing["steps_per_second"]
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise LedgerError(f"{snapshot.ledger.folder / METRICS}, row {index + 1}: {error!r}") from None
-        if rate is not None:
-            numbers.append(("timing/steps_per_second", float(rate)))
-        for position, (name, value) in enumerate(numbers):
-            yield index + (position + 1 == len(numbers)), Metric(name, value, milliseconds, steps)
-
-
-def as_params(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """`section.key` -> text, as long as MLflow takes; lists as JSON."""
-    texts = ((key, value if isinstance(value, str) else json.dumps(value, default=str))
-             for key, value in flattened(config, prefix, empty=True))  # fmt: skip
-    return {key[:_MAX_KEY]: text[:_MAX_PARAM] for key, text in texts}
-
-
-def _tags(snapshot: Snapshot) -> dict[str, str]:
-    status = snapshot.status
-    tags = {
-        "space_dist.seed": str(status.seed),
-        "space_dist.name": status.name,
-        "space_dist.state": status.state,
-        STARTED_TAG: repr(status.started_at),
-        "space_dist.folder": str(snapshot.ledger.folder),
-        "space_dist.fingerprint_changed": str(status.fingerprint_changed).lower(),
-        **{f"space_dist.fingerprint.{key}": str(value) for key, value in status.fingerprint.items()},
-        NOTE_TAG: snapshot.note,
-        **(snapshot.part.tags if snapshot.part is not None else {}),
-    }
-    return {key: value[:MAX_TAG] for key, value in tags.items()}
-
-
-def describe_run(ledger: Ledger, status: Status, config: Mapping[str, Any], rows: Sequence[Row]) -> str:
-    flat = as_params(config)
-    what = " · ".join(flat[key] for key in ("curriculum.kind", "learner.kind", "env.id") if key in flat)
-    lines = [
-        f"**{status.name}**, seed {status.seed}: {what}",
-        "",
-        f"- {status.state}, {status.steps:,} of {status.budget_steps:,} environment steps",
-    ]
-    if status.message:
-        lines.append(f"- {status.message.splitlines()[0][:500]}")
-    evaluations = [row for row in rows if row["kind"] == "evaluation"]
-    if evaluations:
-        last = evaluations[-1]
-        when = "at the end" if status.state == "done" else f"at {last['steps']:,} steps"
-        lines += [f"- {split} return {when}: {_shown(last[split]['return'])}, success {_shown(last[split]['success'])}"
-                  for split in ("test", "train")]  # fmt: skip
-    lines.append(f"- folder `{ledger.folder}`")
-    return "\n".join(lines)
-
-
-def _shown(value: float | None) -> str:
-    return "—" if value is None else f"{value:.4g}"
-
-
-# ---- MLflow's side --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -401,7 +225,7 @@ class Store:
         run = self._client.create_run(
             experiment_id,
             start_time=round(status.started_at * 1000),
-            tags={RUN_TAG: snapshot.key, **_tags(snapshot)},
+            tags={RUN_TAG: snapshot.key, **tags_of(snapshot)},
             run_name=snapshot.title,
         )
         return run, True
@@ -410,7 +234,7 @@ class Store:
     def _superseded(run: MlflowRun, snapshot: Snapshot) -> bool:
         """Whether points are there of another run in the same folder, which was removed to start afresh."""
         there = run.data.tags.get(ROWS_TAG, "0") != "0"
-        return there and run.data.tags.get(STARTED_TAG) != _tags(snapshot)[STARTED_TAG]
+        return there and run.data.tags.get(STARTED_TAG) != tags_of(snapshot)[STARTED_TAG]
 
     def _push_params(self, run: MlflowRun, snapshot: Snapshot) -> None:
         """Those that are not there yet: a param never changes, and a batch that was cut off is completed."""
@@ -433,7 +257,7 @@ class Store:
             batch.clear()
 
         complete = there
-        for complete, metric in _metrics(snapshot, there):
+        for complete, metric in metrics_of(snapshot, there):
             batch.append(metric)
             if len(batch) == _MAX_METRICS:
                 send(complete)
@@ -467,7 +291,7 @@ class Store:
         """Tags and status, after the rows: nothing may look finished before its numbers are there."""
         from mlflow.entities import RunTag
 
-        changed = [RunTag(key, value) for key, value in _tags(snapshot).items() if run.data.tags.get(key) != value]
+        changed = [RunTag(key, value) for key, value in tags_of(snapshot).items() if run.data.tags.get(key) != value]
         for start in range(0, len(changed), _MAX_TAGS):
             self._client.log_batch(run.info.run_id, tags=changed[start : start + _MAX_TAGS])
         self._push_ending(run, snapshot.mlflow_status, snapshot.ended_at)
