@@ -38,15 +38,28 @@ def _keep_folders_in_memory() -> None:
 _keep_folders_in_memory()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that start Slurm, an emulator, Ray or servers come first: they take longest, and must not be begun last.
+# Files that take longest, from the longest on: minutes of waiting, of emulating, or of both.
+_LONGEST = (
+    "chaos/test_chaos", "test_golden_intel", "test_golden_amd", "test_slurm_cluster", "test_determinism",
+    "test_grid_cluster", "test_lean_replay", "test_learners", "faults/test_parts", "test_grid_tracking",
+    "faults/test_every_write", "faults/test_ray_itself", "test_importing", "faults/test_endings", "test_rival_runs",
+    "test_actors", "test_distributed", "faults/test_owners_and_disks", "faults/test_requests", "faults/test_damage",
+)  # fmt: skip
 
-    pytest-xdist deals out whole files in this order, with `--no-loadscope-reorder`.
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files come first, then others that start Slurm, an emulator, Ray or servers.
+
+    pytest-xdist deals out whole files in this order, with `--no-loadscope-reorder`: one that is begun last would be
+    waited for on one core.
     """
+    here, places = Path(__file__).parent, {name: place for place, name in enumerate(_LONGEST)}
     ranks: dict[Path, int] = {}
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        rank = 0 if marks & {"slurm", "qemu"} else 1 if marks & {"ray", "server"} else 2
+        rank = len(places) + (0 if marks & {"slurm", "qemu", "ray", "server"} else 1)
+        if item.path.is_relative_to(here):
+            rank = places.get(item.path.relative_to(here).with_suffix("").as_posix(), rank)
         ranks[item.path] = min(rank, ranks.get(item.path, rank))
     items.sort(key=lambda item: ranks[item.path])
 

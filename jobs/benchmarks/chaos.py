@@ -306,6 +306,11 @@ class _Rehearsal:
 
     def _keep_submitted(self) -> None:
         """Submit again if the last submitter has ended before the grid was done, as a user would."""
+        if self._head.process is not None and self._head.process.poll() is not None:
+            said = (self._folder / "head.log").read_text(errors="replace")
+            self._result.faults.append(f"the Ray head ended, which nobody had harmed: {said[-700:]}")
+            self._expected += 1
+            self._restart(self._head)
         if self._submitter is None or (code := self._submitter.poll()) is None:
             return
         said = (self._folder / f"submitter-{self._result.submissions}.log").read_text(errors="replace")
@@ -395,7 +400,8 @@ class _Rehearsal:
             raise _Missed
         start = time.monotonic()
         for victim in victims:
-            victim.send_signal(signal.SIGSTOP if verb == "stop" else signal.SIGKILL)
+            with contextlib.suppress(psutil.NoSuchProcess):  # parts of a Ray head end with the one that was hit before
+                victim.send_signal(signal.SIGSTOP if verb == "stop" else signal.SIGKILL)
         if name in ("conductor", "submitter", "Ray head"):
             self._expected += 1
         fell = until(lambda: all(is_hit(victim, verb) for victim in victims), 5.0, 0.02)

@@ -161,7 +161,7 @@ def test_a_grid_whose_own_ray_dies_ends_with_75(tmp_path: Path) -> None:
 
 
 ENDS = """
-import os, subprocess, sys
+import os, subprocess, sys, time
 from pathlib import Path
 import psutil
 from space_dist.run import ray_watch
@@ -176,7 +176,10 @@ for name in ("raylet", "gcs_server"):
 really = os._exit
 
 def end(code):
-    print(found["raylet"], found["gcs_server"], psutil.Process(found["raylet"]).status(), flush=True)
+    raylet, until = psutil.Process(found["raylet"]), time.monotonic() + 8.0  # by 10 s it is killed all the same
+    while raylet.status() not in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP) and time.monotonic() < until:
+        time.sleep(0.01)  # told to stop, it does nothing more, and is seen as stopped once its turn on a CPU has come
+    print(found["raylet"], found["gcs_server"], raylet.status(), flush=True)
     really(code)
 
 os._exit = end

@@ -103,6 +103,11 @@ CASES: dict[str, tuple[str, list[str]]] = {
 
 
 @functools.cache
+def _shipped(file: Path) -> configs.InstancesConfig:
+    return configs.load(file).instances
+
+
+@functools.cache
 def _instances(file: Path, count: int) -> list[list[str]]:
     with file.open(newline="") as stream:
         return list(csv.reader(stream))[: count + 1]
@@ -112,8 +117,7 @@ def config_of(name: str, folder: Path, also: tuple[str, ...] = ()) -> configs.Ru
     """A case's config, on the first instances of the shipped sets, which are copied into `folder`."""
     base, settings = CASES[name]
     file = ROOT / "configs" / f"{base}.yaml"
-    shipped = configs.load(file).instances
-    made = []
+    shipped, made = _shipped(file), []
     for split, source, count in (("train", shipped.train, _TRAIN), ("test", shipped.test, _TEST)):
         target, rows = folder / f"{split}.csv", _instances(source, count)
         if (name, split) == ("manual", "train"):

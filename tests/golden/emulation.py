@@ -69,7 +69,8 @@ def _environment(cpu: str) -> dict[str, str]:
     # Kept from one run of the tests to the next, as pytest's own folders are not.
     folder = Path(tempfile.gettempdir()) / f"space-dist-golden-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    environment = dict(os.environ) | target | {"NUMBA_CACHE_DIR": str(folder)}
+    # MiB for what is translated: 128 are full with torch and a few runs, and then all is translated again.
+    environment = dict(os.environ) | target | {"NUMBA_CACHE_DIR": str(folder), "QEMU_TB_SIZE": "1024"}
     _run([sys.executable, "-c", _COMPILE], environment)
     return environment
 
