@@ -98,7 +98,7 @@ class PopulationLearner(OnPolicyLearner):
         self.key = (stack_key(config, observation_space, action_space), dtype, device, self.stacked)
 
     @property
-    def members(self) -> Sequence[PopulationLearner]:
+    def learners(self) -> Sequence[PopulationLearner]:
         """See `Learner`."""
         return (self,)
 
