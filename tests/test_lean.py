@@ -72,8 +72,8 @@ def recorded(learner: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
 
     def ours(self: Any, *arguments: Any) -> lean.Report:
         report = lean_update(self, *arguments)
-        seen.norms.extend(norm for norm in report.told[:, NORM] if norm)
-        seen.stopped = report.told[-1, NORM] == 0.0
+        seen.norms.extend(norm for norm in report.recorded[:, NORM] if norm)
+        seen.stopped = report.recorded[-1, NORM] == 0.0
         seen.gradient = seen.gradient * min(1.0, learner.model.max_grad_norm / (seen.norms[-1] + 1e-6))
         return report
 
@@ -200,7 +200,7 @@ def test_the_policy_that_acted_is_its_own_to_the_bit(env_id: str, monkeypatch: p
     lean_update = lean.Network.update
 
     def watched(self: Any, *arguments: Any) -> lean.Report:
-        told.append(lean_update(self, *arguments).told)
+        told.append(lean_update(self, *arguments).recorded)
         return lean.Report(told[-1], 4, 0)
 
     monkeypatch.setattr(lean.Network, "update", watched)
