@@ -18,7 +18,7 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner import lean_replay, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
-from space_dist.run.building import resolved, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.test_lean import Casting, assert_resumed_to_the_same_bytes, close
@@ -361,7 +361,7 @@ def test_numba_that_may_not_compile_is_told(kind: str, monkeypatch: pytest.Monke
 
 def test_there_is_no_population_of_it() -> None:
     config = configs.load(CARTPOLE, ["learner.update=lean", "engine=auto"])
-    assert resolved(config, spec_of(config)).engine == "single"
+    assert Blueprint.of(config).config.engine == "single"
     with pytest.raises(ConfigError, match=r"engine: population learns with learner\.kind: ppo or trpo, not dqn"):
         learners.refuse_population(config.learner, spaces.Box(-1.0, 1.0, (3,)), spaces.Discrete(2))
 

@@ -96,12 +96,11 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
-    from space_dist.run.building import make_setup, spec_of
-    from space_dist.run.launch import read_instances
+    from space_dist.run.building import Blueprint
 
     run = configs.load(config, list(overrides or []))
     with about(str(config)):
-        spec = spec_of(run)
-        make_setup(run, spec, *read_instances(run, spec.context_bounds))
+        blueprint = Blueprint.of(run)
+        blueprint.setup(*blueprint.instances())
     print(configs.dump(run), end="")
     delivered()
