@@ -205,9 +205,10 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
 
     Relative paths in the grid file are relative to it. Raises ConfigError with file and key of every fault.
     """
-    grid = configs.check(GridConfig, configs.read_yaml(path), str(path))
-    folder = path.absolute().parent
-    bases = {base: configs.read(folder / base) for base in grid.extends}
+    place = configs.located(path)
+    grid = configs.check(GridConfig, configs.read_yaml(place), str(path))
+    folder = place.absolute().parent
+    bases = {base: configs.read(Path(configs.beside(base, folder))) for base in grid.extends}
     n_runs = len(grid.seed_list())
     cells: list[tuple[dict[str, Any], dict[str, Any]]] = []
     try:
@@ -231,7 +232,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
 def _from_folder(value: Any, folder: Path) -> Any:
     if isinstance(value, dict):
         return configs.from_folder(value, folder)
-    return str(folder / value) if isinstance(value, str) and value else value
+    return configs.beside(value, folder)
 
 
 def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:
@@ -490,7 +491,7 @@ def find_grid(path: Path, root: Path) -> Grid:
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
-    grid = Grid(root / configs.check(GridConfig, configs.read_yaml(path), str(path)).name)
+    grid = Grid(root / configs.check(GridConfig, configs.read_yaml(configs.located(path)), str(path)).name)
     if not grid.manifest_file.exists():
         raise LedgerError(
             f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}` freezes it there "

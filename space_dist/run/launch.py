@@ -42,6 +42,7 @@ from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Cluster, InProcess
 from space_dist.run.training import Progress, Training
+from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import fingerprint
@@ -323,7 +324,8 @@ def _cluster(active: ActiveRun) -> Iterator[Cluster]:
         return
     if config.resources.address == "local":
         private_ray()
-    from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
+    with needed_from("ray", f"resources.workers: {config.resources.workers}", "use resources.workers=0"):
+        from space_dist.run.ray_cluster import RayCluster  # it takes a second, and is not needed without workers
 
     with contextlib.ExitStack() as stack:
         with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler

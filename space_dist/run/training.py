@@ -413,7 +413,13 @@ class Training:
         yield from self._commit("done")
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
-        self._writer.write_model(arrays, {**description, "context_visible": self._config.env.context_visible})
+        bounds = self._setup.spec.context_bounds
+        description["context_visible"] = self._config.env.context_visible
+        description["context"] = {
+            "names": list(bounds.names), "low": bounds.low.tolist(), "high": bounds.high.tolist(),
+            "formula": "2 * (context - low) / (high - low) - 1, clipped to [-1, 1]; at the end of an observation",
+        }  # fmt: skip
+        self._writer.write_model(arrays, description)
         self._writer.set_status(self._new_status("done"))
 
     # ---- waiting, and the ledger ----
