@@ -162,7 +162,7 @@ def as_config(
 
 
 def _from_here(key: str, value: Any) -> Any:
-    if key.partition(".")[0] != "instances":
+    if key.partition(".")[0] not in ("instances", "init_from"):
         return value
     return configs.from_folder(value, Path.cwd()) if isinstance(value, dict) else configs.beside(value, Path.cwd())
 

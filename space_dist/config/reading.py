@@ -42,6 +42,8 @@ def read(path: Path) -> dict[str, Any]:
 
 def from_its_folder(data: dict[str, Any], folder: Path) -> None:
     """Take the relative paths in a run's plain data from `folder`."""
+    if "init_from" in data:
+        data["init_from"] = beside(data["init_from"], folder)
     instances = data.get("instances")
     if isinstance(instances, dict):
         data["instances"] = from_folder(instances, folder)
@@ -96,13 +98,13 @@ def apply_override(data: dict[str, Any], override: str) -> None:
     if not equals or not all(parts) or not override.isprintable():
         raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
     value = parse_yaml(text, f"--set {override}")
-    if parts[0] == "instances":
+    if parts[0] in ("instances", "init_from"):
         value = _from_here(value)
     put(data, ".".join(parts), value, f"--set {override}")
 
 
 def _from_here(value: Any) -> Any:
-    """Instance paths of an override, relative to the current folder, as absolute ones."""
+    """Paths of an override, relative to the current folder, as absolute ones."""
     if isinstance(value, dict):
         return {key: _from_here(item) for key, item in value.items()}
     return beside(value, Path.cwd())

@@ -219,7 +219,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
             for key, value in (*grid.set.items(), *point.items()):
                 if key == "extends":
                     continue
-                here = _from_folder(value, folder) if key.partition(".")[0] == "instances" else value
+                here = _from_folder(value, folder) if key.partition(".")[0] in ("instances", "init_from") else value
                 configs.put(data, key, json.loads(json.dumps(here)), key)
             cells.append((point, data))
     except ConfigError as error:
@@ -473,10 +473,10 @@ class Grid:
         data = {
             **run.cell.config,
             "seed": run.seed,
-            "instances": configs.from_folder(run.cell.config["instances"], self.folder),
             "resources": resources,
             "tracking": {"uri": manifest.tracking.uri, "experiment": manifest.experiment, "live": False},
         }
+        configs.from_its_folder(data, self.folder)
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")
 
 
