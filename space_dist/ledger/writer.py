@@ -89,10 +89,10 @@ class RunWriter:
                 atomic_write(path, content)
             self._files |= {name: [sha256] for name, sha256 in hashes.items()}
 
-    def hand_over(self, status: Status, keep: Callable[[Checkpoint], bool]) -> None:
+    def hand_over(self, status: Status, keep: Callable[[Checkpoint], bool]) -> Status:
         """Make this a run of another identity, `status.identity`: the checkpoints that `keep` are its own from now on.
 
-        The others are forgotten. Interrupted at any moment, it can be done again.
+        The others are forgotten. Returns where it stands then. Interrupted at any moment, it can be done again.
         """
         with _clear_errors(self.ledger.folder), self._lock.held():
             newest: Path | None = None
@@ -122,6 +122,7 @@ class RunWriter:
             self._write_status(status)
             for file in forgotten:
                 file.unlink()
+        return status
 
     def restore(self) -> Checkpoint | None:
         """Cut every row file back to the newest intact checkpoint and return it; to nothing where none was written.

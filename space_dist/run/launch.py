@@ -205,8 +205,8 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         )  # fmt: skip
     stored = configs.dump(_self_contained(config))
     if shorter is not None:
-        writer.hand_over(status, within(shorter, blueprint.spec.horizon))
-        status = writer.status or status
+        now_at = writer.hand_over(status, within(shorter, blueprint.spec.horizon))
+        status = replace(status, steps=now_at.steps, round=now_at.round)
         log.info("going on under a larger budget, from round %d", status.round)
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
     ledger.stop_file.unlink(missing_ok=True)
