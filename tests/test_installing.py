@@ -158,10 +158,14 @@ def test_configs_lists_and_copies(
 # ---- a project to start with -----------------------------------------------------------------------------------------
 
 
-def test_a_new_project_runs_as_it_is_written(tmp_path: Path) -> None:
-    program = [sys.executable, "-P", "-m", "space_dist.cli"]
-    assert "Next: cd mine" in said([*program, "init", "mine"], tmp_path)
+def test_a_new_project_runs_as_it_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     mine = tmp_path / "mine"
+    assert command(monkeypatch, "init", mine) == 0
+    assert f"Next: cd {mine}" in capsys.readouterr().out
+    monkeypatch.chdir(mine)
+    monkeypatch.delitem(sys.modules, "slider", raising=False)
     page = (mine / "README.md").read_text()
     told = re.findall(r"^space-dist (.+?)(?:  +#.*)?$", page, re.MULTILINE)
     assert len(told) == 8
@@ -173,7 +177,7 @@ def test_a_new_project_runs_as_it_is_written(tmp_path: Path) -> None:
             text = (mine / "grid.yaml").read_text()
             (mine / "grid.yaml").write_text(f"{text}set: {{ budget.steps: 2048 }}\ntracking: {{ uri: null }}\n")
             words += ["--max-parallel", "1"]
-        said([*program, *words], mine)
+        assert command(monkeypatch, *words) == 0, (line, capsys.readouterr().err)
     for file in ("runs/slider_space/s0/model.npz", "report/report.png", "runs/slider/report/report.html",
                  "slurm_scripts/submit.sh", "more_instances/uniform_train.csv"):  # fmt: skip
         assert (mine / file).exists(), file
@@ -220,7 +224,7 @@ def test_what_is_missing_is_named_with_its_extra(
         f"from space_dist.cli import main\nmain()\n"
     )
     quiet = ("--set", "tracking.uri=null") if words[0] == "train" else ()
-    told = said([sys.executable, hidden, *words, *quiet], tmp_path, 1 if words[0] == "train" else 2)
+    told = said([sys.executable, hidden, *words, *quiet], tmp_path, 2)
     assert sentence in " ".join(told.split())
 
 
