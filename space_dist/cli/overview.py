@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -23,14 +24,16 @@ if TYPE_CHECKING:
 
 _LOG_SECONDS = 30.0
 _SHOWN_RUNS = 12
+_COUNT_SECONDS = 5.0  # between two looks at how far all running runs are
 
 
 @contextlib.contextmanager
 def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], None]]:
     """On a terminal a table of what runs now; elsewhere a line now and then."""
+    time_left = _TimeLeft(place)
     if console.is_terminal:
         with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda overview: live.update(_live_table(manifest, place, overview))
+            yield lambda overview: live.update(_live_table(manifest, place, overview, time_left.in_words(overview)))
         return
     logged_at = 0.0
     logged: tuple[object, ...] = ()
@@ -39,7 +42,7 @@ def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], No
         nonlocal logged_at, logged
         line = (
             f"{manifest.name}: {overview.done} of {overview.total} done, {len(overview.running)} running, "
-            f"{overview.waiting} waiting, {overview.failed} failed"
+            f"{overview.waiting} waiting, {overview.failed} failed{time_left.in_words(overview)}"
         )
         if overview.message:
             line += f" (last: {overview.message})"
@@ -51,7 +54,36 @@ def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], No
     yield observe
 
 
-def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
+class _TimeLeft:
+    """How long a grid still takes, at the rate of what was seen of it."""
+
+    def __init__(self, place: Grid) -> None:
+        self._place = place
+        self._first: tuple[float, int] | None = None  # when we looked first, and the steps that were left then
+        self._looked, self._words = 0.0, ""
+
+    def in_words(self, overview: Overview) -> str:
+        """`, about 0:12:00 left`; nothing as long as that cannot be told."""
+        now = time.monotonic()
+        if now - self._looked >= _COUNT_SECONDS or not overview.steps_left:
+            self._looked, self._words = now, self._estimated(overview, now)
+        return self._words
+
+    def _estimated(self, overview: Overview, now: float) -> str:
+        taken = 0
+        for run in overview.running:
+            with contextlib.suppress(SpaceDistError):
+                taken += self._place.ledger(run).status().steps
+        left = max(0, overview.steps_left - taken)
+        if self._first is None:
+            self._first = now, left
+        seconds, done = now - self._first[0], self._first[1] - left
+        if not left or done <= 0:
+            return ""
+        return f", about {datetime.timedelta(seconds=round(left * seconds / done))} left"
+
+
+def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: str) -> Table:
     from space_dist.ledger import CURRICULUM
 
     table = Table(box=None, pad_edge=False, show_header=False)
@@ -59,7 +91,7 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
     bar = "█" * round(24 * done) + "░" * (24 - round(24 * done))
     counts = f"{overview.done} of {overview.total} runs done"
     counts += f", {overview.failed} failed" if overview.failed else ""
-    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting"))
+    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting{time_left}"))
     for run in overview.running[:_SHOWN_RUNS]:
         ledger, line = place.ledger(run), "starting"
         with contextlib.suppress(SpaceDistError, KeyError, IndexError):

@@ -40,7 +40,7 @@ from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_c
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
-from space_dist.run.cluster import Cluster, InProcess
+from space_dist.run.cluster import Cluster, InProcess, n_workers
 from space_dist.run.training import Progress, Training
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
@@ -69,8 +69,11 @@ def launch(
     resume: bool,
     stop: StopRequests,
     observe: Callable[[Progress], None] = lambda progress: None,
+    waiting: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
     """Run `config` in `folder` to its end, or go on where it stopped.
+
+    observe: told of progress. waiting: told what is waited for, before and behind that: `starting Ray`.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
@@ -78,8 +81,11 @@ def launch(
     """
     with begun(config, folder, resume=resume, stop=stop) as active:
         if not active.outcome.already_done:
-            with _cluster(active) as cluster:
+            with _cluster(active, waiting) as cluster:
+                waiting("preparing the learner")
                 active.training(cluster, observe).run()
+    if active.pusher is not None:
+        waiting(f"mirroring to MLflow, for {_FINAL_PUSH_SECONDS:.0f} s at most")
     return active.finished()
 
 
@@ -315,14 +321,19 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
 
 
 @contextlib.contextmanager
-def _cluster(active: ActiveRun) -> Iterator[Cluster]:
+def _cluster(active: ActiveRun, waiting: Callable[[str], None]) -> Iterator[Cluster]:
     config = active.blueprint.config
-    if config.resources.workers == 0:
+    workers = n_workers(config, active.blueprint.spec)
+    if workers == 0:
         with contextlib.closing(InProcess(config, active.setup)) as here:
             yield here
         return
+    actors = f"{workers} rollout actor{'s' if workers > 1 else ''}"
     if config.resources.address == "local":
+        waiting(f"starting Ray with {actors}")
         private_ray()
+    else:
+        waiting(f"waiting for room for {actors} on the Ray at {config.resources.address}")
     from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
