@@ -17,13 +17,14 @@ from space_dist.cli.terminal import console, say
 from space_dist.errors import SpaceDistError
 
 if TYPE_CHECKING:
-    from space_dist.experiment.manifest import Grid, Manifest
+    from space_dist.experiment.manifest import Cell, Grid, Manifest
     from space_dist.experiment.status import RunStatus
     from space_dist.grid.conductor import Overview
     from space_dist.slurm.queue import Queue
 
 _LOG_SECONDS = 30.0
 _SHOWN_RUNS = 12
+_ANY_WIDTH = 10_000  # characters
 _COUNT_SECONDS = 5.0  # between two looks at how far all running runs are
 
 
@@ -87,6 +88,7 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
     from space_dist.ledger import CURRICULUM
 
     table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(overflow="fold")
     done = overview.done / max(1, overview.total)
     bar = "█" * round(24 * done) + "░" * (24 - round(24 * done))
     counts = f"{overview.done} of {overview.total} runs done"
@@ -110,23 +112,33 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
 
 
 def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
-    """One line for each cell: how its seeds stand."""
-    table = Table(title=Text(manifest.name), title_justify="left")
-    for column in ("cell", "id", "done", "running", "waiting", "failed", "steps"):
-        table.add_column(column, justify="left" if column in ("cell", "id") else "right")
+    """How the seeds of each cell stand: a line for each, and a label's whole words, whatever the terminal's width."""
     of_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
     for run_status in found:
         of_cell[run_status.run.cell.id].append(run_status)
-    for cell in manifest.cells:
-        counts = Counter(run_status.condition for run_status in of_cell[cell.id])
-        steps = sum(run_status.steps for run_status in of_cell[cell.id])
-        of_all = sum(run_status.budget_steps for run_status in of_cell[cell.id])
-        table.add_row(
-            Text(cell.label), cell.id, f"{counts['done']}/{len(of_cell[cell.id])}",
-            *(str(counts[condition]) if counts[condition] else "" for condition in ("running", "waiting", "failed")),
-            f"{steps / max(1, of_all):.0%} of {of_all:,}",
-        )  # fmt: skip
-    console.print(table)
+    rows = [_cell_row(cell, of_cell[cell.id]) for cell in manifest.cells]
+    table = Table(title=Text(manifest.name), title_justify="left")
+    for column in rows[0]:
+        table.add_column(column, justify="left" if column in ("cell", "id") else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row.values()))
+    if console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum <= console.width:
+        console.print(table)
+        return
+    say(manifest.name)
+    for row in rows:
+        say(row["cell"])
+        say("  " + ", ".join(f"{column} {text}" for column, text in row.items() if text and column != "cell"))
+
+
+def _cell_row(cell: Cell, found: Sequence[RunStatus]) -> dict[str, str]:
+    counts = Counter(run_status.condition for run_status in found)
+    steps, of_all = (sum(getattr(one, name) for one in found) for name in ("steps", "budget_steps"))
+    return {
+        "cell": cell.label, "id": cell.id, "done": f"{counts['done']}/{len(found)}",
+        **{condition: str(counts[condition] or "") for condition in ("running", "waiting", "failed")},
+        "steps": f"{steps / max(1, of_all):.0%} of {of_all:,}",
+    }  # fmt: skip
 
 
 def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
