@@ -86,7 +86,7 @@ def test_what_was_installed_from_the_wheel_runs_from_any_folder(built: Path, tmp
     said([sys.executable, "-m", "venv", "--without-pip", home], tmp_path)
     (packages,) = home.glob("lib/*/site-packages")
     with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(packages)
+        archive.extractall(packages)  # noqa: S202 - our own wheel
     (packages / "dependencies.pth").write_text("".join(f"{path}\n" for path in site.getsitepackages()))
     program = [home / "bin/python", "-P", "-m", "space_dist.cli"]
     where = said([home / "bin/python", "-P", "-c", "import space_dist; print(space_dist.__file__)"], place)

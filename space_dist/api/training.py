@@ -126,7 +126,10 @@ def train(
                 progress(now)
             show(line_of_run(run.name, run.seed, now))
 
-        outcome = launch(run, folder, resume=resume, stop=StopRequests(), observe=observe)
+        def waiting(what: str) -> None:
+            show(f"{run.name} s{run.seed}  {what}")
+
+        outcome = launch(run, folder, resume=resume, stop=StopRequests(), observe=observe, waiting=waiting)
     return Run(outcome.ledger.folder, tracking_warning=outcome.tracking_warning)
 
 

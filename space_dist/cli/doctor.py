@@ -97,7 +97,7 @@ def cores_and_memory() -> Iterator[Finding]:
     """What this process may use of the machine."""
     import psutil
 
-    from space_dist.grid.warm import cores
+    from space_dist.system.workplace import cores
 
     ours, seen = cores(), os.cpu_count() or 1
     yield Finding("ok", f"{ours} core{'s' if ours > 1 else ''}" + (f" of {seen} that are seen" if ours < seen else ""))

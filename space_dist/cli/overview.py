@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -16,21 +17,24 @@ from space_dist.cli.terminal import console, say
 from space_dist.errors import SpaceDistError
 
 if TYPE_CHECKING:
-    from space_dist.experiment.manifest import Grid, Manifest
+    from space_dist.experiment.manifest import Cell, Grid, Manifest
     from space_dist.experiment.status import RunStatus
     from space_dist.grid.conductor import Overview
     from space_dist.slurm.queue import Queue
 
 _LOG_SECONDS = 30.0
 _SHOWN_RUNS = 12
+_ANY_WIDTH = 10_000  # characters
+_COUNT_SECONDS = 5.0  # between two looks at how far all running runs are
 
 
 @contextlib.contextmanager
 def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], None]]:
     """On a terminal a table of what runs now; elsewhere a line now and then."""
+    time_left = _TimeLeft(place)
     if console.is_terminal:
         with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda overview: live.update(_live_table(manifest, place, overview))
+            yield lambda overview: live.update(_live_table(manifest, place, overview, time_left.in_words(overview)))
         return
     logged_at = 0.0
     logged: tuple[object, ...] = ()
@@ -39,7 +43,7 @@ def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], No
         nonlocal logged_at, logged
         line = (
             f"{manifest.name}: {overview.done} of {overview.total} done, {len(overview.running)} running, "
-            f"{overview.waiting} waiting, {overview.failed} failed"
+            f"{overview.waiting} waiting, {overview.failed} failed{time_left.in_words(overview)}"
         )
         if overview.message:
             line += f" (last: {overview.message})"
@@ -51,15 +55,45 @@ def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], No
     yield observe
 
 
-def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
+class _TimeLeft:
+    """How long a grid still takes, at the rate of what was seen of it."""
+
+    def __init__(self, place: Grid) -> None:
+        self._place = place
+        self._first: tuple[float, int] | None = None  # when we looked first, and the steps that were left then
+        self._looked, self._words = 0.0, ""
+
+    def in_words(self, overview: Overview) -> str:
+        """`, about 0:12:00 left`; nothing as long as that cannot be told."""
+        now = time.monotonic()
+        if now - self._looked >= _COUNT_SECONDS or not overview.steps_left:
+            self._looked, self._words = now, self._estimated(overview, now)
+        return self._words
+
+    def _estimated(self, overview: Overview, now: float) -> str:
+        taken = 0
+        for run in overview.running:
+            with contextlib.suppress(SpaceDistError):
+                taken += self._place.ledger(run).status().steps
+        left = max(0, overview.steps_left - taken)
+        if self._first is None:
+            self._first = now, left
+        seconds, done = now - self._first[0], self._first[1] - left
+        if not left or done <= 0:
+            return ""
+        return f", about {datetime.timedelta(seconds=round(left * seconds / done))} left"
+
+
+def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: str) -> Table:
     from space_dist.ledger import CURRICULUM
 
     table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(overflow="fold")
     done = overview.done / max(1, overview.total)
     bar = "█" * round(24 * done) + "░" * (24 - round(24 * done))
     counts = f"{overview.done} of {overview.total} runs done"
     counts += f", {overview.failed} failed" if overview.failed else ""
-    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting"))
+    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting{time_left}"))
     for run in overview.running[:_SHOWN_RUNS]:
         ledger, line = place.ledger(run), "starting"
         with contextlib.suppress(SpaceDistError, KeyError, IndexError):
@@ -78,23 +112,33 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
 
 
 def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
-    """One line for each cell: how its seeds stand."""
-    table = Table(title=Text(manifest.name), title_justify="left")
-    for column in ("cell", "id", "done", "running", "waiting", "failed", "steps"):
-        table.add_column(column, justify="left" if column in ("cell", "id") else "right")
+    """How the seeds of each cell stand: a line for each, and a label's whole words, whatever the terminal's width."""
     of_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
     for run_status in found:
         of_cell[run_status.run.cell.id].append(run_status)
-    for cell in manifest.cells:
-        counts = Counter(run_status.condition for run_status in of_cell[cell.id])
-        steps = sum(run_status.steps for run_status in of_cell[cell.id])
-        of_all = sum(run_status.budget_steps for run_status in of_cell[cell.id])
-        table.add_row(
-            Text(cell.label), cell.id, f"{counts['done']}/{len(of_cell[cell.id])}",
-            *(str(counts[condition]) if counts[condition] else "" for condition in ("running", "waiting", "failed")),
-            f"{steps / max(1, of_all):.0%} of {of_all:,}",
-        )  # fmt: skip
-    console.print(table)
+    rows = [_cell_row(cell, of_cell[cell.id]) for cell in manifest.cells]
+    table = Table(title=Text(manifest.name), title_justify="left")
+    for column in rows[0]:
+        table.add_column(column, justify="left" if column in ("cell", "id") else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row.values()))
+    if console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum <= console.width:
+        console.print(table)
+        return
+    say(manifest.name)
+    for row in rows:
+        say(row["cell"])
+        say("  " + ", ".join(f"{column} {text}" for column, text in row.items() if text and column != "cell"))
+
+
+def _cell_row(cell: Cell, found: Sequence[RunStatus]) -> dict[str, str]:
+    counts = Counter(run_status.condition for run_status in found)
+    steps, of_all = (sum(getattr(one, name) for one in found) for name in ("steps", "budget_steps"))
+    return {
+        "cell": cell.label, "id": cell.id, "done": f"{counts['done']}/{len(found)}",
+        **{condition: str(counts[condition] or "") for condition in ("running", "waiting", "failed")},
+        "steps": f"{steps / max(1, of_all):.0%} of {of_all:,}",
+    }  # fmt: skip
 
 
 def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
 from space_dist.config.tracking_uri import checked_uri
 from space_dist.system.importing import why_refused
 
 MAX_LIST = 10_000  # values of a list in a config
+_MAX_WORKERS = 4096
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
@@ -65,14 +66,27 @@ class InstancesConfig(Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-class RolloutConfig(Section):
-    """How transitions are collected. All of it decides results; how many workers share the shards does not."""
+def _chosen(value: Any) -> Any:
+    """A number that is found for the user: 0 stands for it until what it must fit is known."""
+    return 0 if value == "auto" else value
 
-    shards: int = Field(default=4, ge=1, le=4096)
-    """Independent parts of a round; at most this many workers can share it."""
-    slots: int = Field(default=4, ge=1, le=65536)
+
+_AUTO = BeforeValidator(_chosen)
+_USUAL = 4  # shards and slots
+
+
+class RolloutConfig(Section):
+    """How transitions are collected; auto: by numbers that fit. All of it decides results; how many workers share the
+    shards does not.
+    """
+
+    shards: Annotated[int, _AUTO] = Field(default=0, ge=0, le=4096)
+    """Independent parts of a round; at most this many workers can share it. 0 or auto: 4, or the most below with which
+    shards * slots divides learner.n_steps."""
+    slots: Annotated[int, _AUTO] = Field(default=0, ge=0, le=65536)
     """Environments stepped together in a shard. shards * slots must divide learner.n_steps; episodes go on from round
-    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon."""
+    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon. 0 or auto: as
+    for shards."""
     passes: float = Field(default=1.0, gt=0.0)
     """Length of an iteration: as many updates as cover this many passes over the selected instances at full horizon."""
     start_states: int = Field(default=1, ge=1, le=1000)
@@ -82,6 +96,18 @@ class RolloutConfig(Section):
     """Collect a round while the update on the one before it runs, with the weights from before that update: for slow
     environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO and A2C
     without normalisation. Source: ours."""
+
+    def fitted(self, n_steps: int | None) -> Self:
+        """The same, with numbers for what is left to be found. n_steps: of an update; None: it ends by episodes."""
+        shards = self.shards or _fitting(n_steps, self.slots or 1)
+        return self.model_copy(update={"shards": shards, "slots": self.slots or _fitting(n_steps, shards)})
+
+
+def _fitting(n_steps: int | None, other: int) -> int:
+    """The usual number, or the most below it whose product with `other` divides `n_steps`; 1 where none does."""
+    if n_steps is None:
+        return 1
+    return next((number for number in range(_USUAL, 1, -1) if n_steps % (number * other) == 0), 1)
 
 
 class BudgetConfig(Section):
@@ -153,9 +179,18 @@ class Patience(Section):
 class ResourcesConfig(Patience):
     """What the run may use. Decides no result."""
 
-    workers: int = Field(default=1, ge=0, le=4096)
-    """Ray rollout actors; 0: everything in this process, without Ray."""
+    workers: int | Literal["auto"] = Field(default="auto")
+    """Ray rollout actors; 0: everything in this process, without Ray. auto: 0 where the environment steps all slots at
+    once, compiled or in NumPy, so that actors gain nothing; else one for each CPU but one, and for each shard, at
+    most."""
     address: str = Field(default="local", min_length=1, max_length=300)
     """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)
     """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
+
+    @field_validator("workers")
+    @classmethod
+    def _so_many(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and not 0 <= value <= _MAX_WORKERS:
+            raise ValueError(f"must be from 0 to {_MAX_WORKERS}, or auto")
+        return value

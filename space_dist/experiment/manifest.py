@@ -206,7 +206,10 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
     Relative paths in the grid file are relative to it. Raises ConfigError with file and key of every fault.
     """
     place = configs.located(path)
-    grid = configs.check(GridConfig, configs.read_yaml(place), str(path))
+    data = configs.read_yaml(place)
+    if "env" in data and "extends" not in data:
+        raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
+    grid = configs.check(GridConfig, data, str(path))
     folder = place.absolute().parent
     bases = {base: configs.read(Path(configs.beside(base, folder))) for base in grid.extends}
     n_runs = len(grid.seed_list())

@@ -40,7 +40,7 @@ from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_c
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
-from space_dist.run.cluster import Cluster, InProcess
+from space_dist.run.cluster import Cluster, InProcess, n_workers
 from space_dist.run.continuing import is_longer, within
 from space_dist.run.starting import weights_in
 from space_dist.run.training import Progress, Training
@@ -72,8 +72,11 @@ def launch(
     resume: bool,
     stop: StopRequests,
     observe: Callable[[Progress], None] = lambda progress: None,
+    waiting: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
     """Run `config` in `folder` to its end, or go on where it stopped.
+
+    observe: told of progress. waiting: told what is waited for, before and behind that: `starting Ray`.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
@@ -81,8 +84,11 @@ def launch(
     """
     with begun(config, folder, resume=resume, stop=stop) as active:
         if not active.outcome.already_done:
-            with _cluster(active) as cluster:
+            with _cluster(active, waiting) as cluster:
+                waiting("preparing the learner")
                 active.training(cluster, observe).run()
+    if active.pusher is not None:
+        waiting(f"mirroring to MLflow, for {_FINAL_PUSH_SECONDS:.0f} s at most")
     return active.finished()
 
 
@@ -336,15 +342,20 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
 
 
 @contextlib.contextmanager
-def _cluster(active: ActiveRun) -> Iterator[Cluster]:
+def _cluster(active: ActiveRun, waiting: Callable[[str], None]) -> Iterator[Cluster]:
     config = active.blueprint.config
-    if config.resources.workers == 0:
+    workers = n_workers(config, active.blueprint.spec)
+    if workers == 0:
         with contextlib.closing(InProcess(config, active.setup)) as here:
             yield here
         return
+    actors = f"{workers} rollout actor{'s' if workers > 1 else ''}"
     if config.resources.address == "local":
+        waiting(f"starting Ray with {actors}")
         private_ray()
-    with needed_from("ray", f"resources.workers: {config.resources.workers}", "use resources.workers=0"):
+    else:
+        waiting(f"waiting for room for {actors} on the Ray at {config.resources.address}")
+    with needed_from("ray", f"resources.workers: {workers}", "use resources.workers=0"):
         from space_dist.run.ray_cluster import RayCluster  # it takes a second, and is not needed without workers
 
     with contextlib.ExitStack() as stack:
