@@ -18,8 +18,8 @@ import typer
 import space_dist
 from space_dist import cli
 from space_dist import config as configs
-from space_dist.cli import doctor as doctors
-from space_dist.cli.doctor import Finding
+from space_dist.cli import health
+from space_dist.cli.health import Finding
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.slurm import load_profile
 from tests.commanding import command
@@ -174,7 +174,7 @@ def test_a_new_project_runs_as_it_is_written(
         if words[0] == "train":
             words += ["--set", "budget.steps=4096", "--set", "tracking.uri=null"]
         if words[:2] == ["grid", "run"]:
-            text = (mine / "grid.yaml").read_text()
+            text = (mine / "grid.yaml").read_text().replace("count: 3", "count: 1")
             (mine / "grid.yaml").write_text(f"{text}set: {{ budget.steps: 2048 }}\ntracking: {{ uri: null }}\n")
             words += ["--max-parallel", "1"]
         assert command(monkeypatch, *words) == 0, (line, capsys.readouterr().err)
@@ -263,25 +263,25 @@ def test_the_doctor_finds_nothing_broken_here(tmp_path: Path) -> None:
 def test_what_is_broken_has_a_mend_and_an_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctors, "_checks", lambda quick: [lambda: iter([Finding("broken", "it is ill", "rest")])])
+    monkeypatch.setattr(health, "_checks", lambda quick: [lambda: iter([Finding("broken", "it is ill", "rest")])])
     assert command(monkeypatch, "doctor") == 1
     assert capsys.readouterr().out == "BROKEN it is ill\n       -> rest\n1 broken\n"
 
 
 def test_what_hangs_and_what_crashes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert doctors._failure("pass") is None
-    assert doctors._failure("raise OSError('no such cable')") == "OSError: no such cable"
-    assert doctors._failure("import os; os.abort()") == "exit code -6"
-    monkeypatch.setitem(doctors._SECONDS, "import", 0.5)
-    assert doctors._failure("import time; time.sleep(60)") == "no answer within 0 s"
-    monkeypatch.setattr(doctors, "_version", lambda distribution: None)
-    for check in (doctors.mlflow_works(ask=True), doctors.ray_works(start=True), doctors.bullet_works()):
+    assert health._failure("pass") is None
+    assert health._failure("raise OSError('no such cable')") == "OSError: no such cable"
+    assert health._failure("import os; os.abort()") == "exit code -6"
+    monkeypatch.setitem(health._SECONDS, "import", 0.5)
+    assert health._failure("import time; time.sleep(60)") == "no answer within 0 s"
+    monkeypatch.setattr(health, "_version", lambda distribution: None)
+    for check in (health.mlflow_works(ask=True), health.ray_works(start=True), health.bullet_works()):
         (found,) = check
         assert (found.state, "pip install 'space-dist[" in found.mend) == ("note", True)
-    monkeypatch.setattr(doctors, "_version", lambda distribution: "3")
-    monkeypatch.setattr(doctors, "_failure", lambda code, kind="import": None)
+    monkeypatch.setattr(health, "_version", lambda distribution: "3")
+    monkeypatch.setattr(health, "_failure", lambda code, kind="import": None)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
-    states = {found.state: found.what for found in doctors.mlflow_works(ask=True)}
+    states = {found.state: found.what for found in health.mlflow_works(ask=True)}
     assert "127.0.0.1 does not answer" in states["broken"]
 
 

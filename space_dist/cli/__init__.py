@@ -14,8 +14,8 @@ from space_dist import __version__
 from space_dist.arithmetic import overruled
 from space_dist.cli import runs, starting
 from space_dist.cli.curricula import curriculum_app
-from space_dist.cli.doctor import doctor
 from space_dist.cli.grids import grid_app
+from space_dist.cli.health import doctor
 from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
 from space_dist.cli.worlds import env_app, render
