@@ -200,35 +200,32 @@ def test_a_folder_that_holds_something_is_left_alone(
 # ---- extras ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("library", "words", "sentence"), [
-    ("ray", ("train", "shipped:pointmass_space", "--workers", "2", "--out", "run"),
+@pytest.mark.parametrize(("words", "sentence"), [
+    (("train", "shipped:pointmass_space", "--workers", "2", "--out", "run"),
      "resources.workers: 2 needs Ray: pip install 'space-dist[ray]', or use resources.workers=0"),
-    ("ray", ("grid", "run", "shipped:pointmass_small", "--max-parallel", "2", "--root", "x"),
+    (("grid", "run", "shipped:pointmass_small", "--max-parallel", "2", "--root", "x"),
      "a grid whose runs go side by side needs Ray: pip install 'space-dist[ray]'"),
-    ("ray", ("grid", "submit", "shipped:pointmass_small", "--address", "http://127.0.0.1:1"),
+    (("grid", "submit", "shipped:pointmass_small", "--address", "http://127.0.0.1:1"),
      "`grid submit` needs Ray: pip install 'space-dist[ray]'"),
-    ("pybullet", ("config", "check", "shipped:antgoal_space"),
-     "this environment needs PyBullet: pip install 'space-dist[bullet]'"),
 ])  # fmt: skip
-def test_what_is_missing_is_named_with_its_extra(
-    library: str, words: tuple[str, ...], sentence: str, tmp_path: Path
-) -> None:
+def test_a_missing_ray_is_named_with_its_extra(words: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
+    """PyBullet's: tests/test_bullet.py."""
     hidden = tmp_path / "hidden.py"
     hidden.write_text(
-        f"import sys\n"
-        f"class Hider:\n"
-        f"    def find_spec(self, name, path=None, target=None):\n"
-        f"        if name.partition('.')[0] == {library!r}:\n"
-        f"            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name)\n"
-        f"sys.meta_path.insert(0, Hider())\n"
-        f"from space_dist.cli import main\nmain()\n"
+        "import sys\n"
+        "class Hider:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] == 'ray':\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Hider())\n"
+        "from space_dist.cli import main\nmain()\n"
     )
     quiet = ("--set", "tracking.uri=null") if words[0] == "train" else ()
     told = said([sys.executable, hidden, *words, *quiet], tmp_path, 2)
     assert sentence in " ".join(told.split())
 
 
-def test_without_mlflow_a_run_is_done_and_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_mlflow_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from space_dist.tracking import store
 
     monkeypatch.setitem(sys.modules, "mlflow", None)
