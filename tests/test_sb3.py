@@ -116,7 +116,7 @@ def run_config(
 def witnessed(config: RunConfig, folder: Path) -> Witness:
     """Our own loop's run of a config."""
     with begun(config, folder, resume=False, stop=StopRequests()) as active:
-        witness = Witness(active.config, active.setup)
+        witness = Witness(active.blueprint.config, active.setup)
         training = active.training(witness)
         assert isinstance(training.learner, SB3Learner)
         witness.learner, update = training.learner, training.learner.update

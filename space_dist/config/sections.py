@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from space_dist.config.tracking_uri import checked_uri
 from space_dist.system.importing import why_refused
@@ -66,12 +66,6 @@ class InstancesConfig(Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-def _chosen(value: Any) -> Any:
-    """A number that is found for the user: 0 stands for it until what it must fit is known."""
-    return 0 if value == "auto" else value
-
-
-_AUTO = BeforeValidator(_chosen)
 _USUAL = 4  # shards and slots
 
 
@@ -80,13 +74,13 @@ class RolloutConfig(Section):
     shards does not.
     """
 
-    shards: Annotated[int, _AUTO] = Field(default=0, ge=0, le=4096)
-    """Independent parts of a round; at most this many workers can share it. 0 or auto: 4, or the most below with which
-    shards * slots divides learner.n_steps."""
-    slots: Annotated[int, _AUTO] = Field(default=0, ge=0, le=65536)
+    shards: int = Field(default=_USUAL, ge=1, le=4096)
+    """Independent parts of a round; at most this many workers can share it. Left out, or auto: 4, or the most below
+    with which shards * slots divides learner.n_steps."""
+    slots: int = Field(default=_USUAL, ge=1, le=65536)
     """Environments stepped together in a shard. shards * slots must divide learner.n_steps; episodes go on from round
-    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon. 0 or auto: as
-    for shards."""
+    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon. Left out, or
+    auto: as for shards."""
     passes: float = Field(default=1.0, gt=0.0)
     """Length of an iteration: as many updates as cover this many passes over the selected instances at full horizon."""
     start_states: int = Field(default=1, ge=1, le=1000)
@@ -97,10 +91,19 @@ class RolloutConfig(Section):
     environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO and A2C
     without normalisation. Source: ours."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _left_out(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        return {key: value for key, value in data.items() if key not in ("shards", "slots") or value != "auto"}
+
     def fitted(self, n_steps: int | None) -> Self:
-        """The same, with numbers for what is left to be found. n_steps: of an update; None: it ends by episodes."""
-        shards = self.shards or _fitting(n_steps, self.slots or 1)
-        return self.model_copy(update={"shards": shards, "slots": self.slots or _fitting(n_steps, shards)})
+        """The same, with numbers that fit for what was left out. n_steps: of an update; None: it ends by episodes."""
+        given = self.model_fields_set
+        shards = self.shards if "shards" in given else _fitting(n_steps, self.slots if "slots" in given else 1)
+        slots = self.slots if "slots" in given else _fitting(n_steps, shards)
+        return self.model_copy(update={"shards": shards, "slots": slots})
 
 
 def _fitting(n_steps: int | None, other: int) -> int:
