@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import types
@@ -17,10 +18,12 @@ import numpy as np
 import pytest
 
 import space_dist
+from space_dist import config as configs
 from space_dist.api import progress
 from space_dist.api.training import as_config
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, LedgerError
+from space_dist.grid.planning import plan
 from space_dist.ledger import CURRICULUM, METRICS
 from space_dist.run.training import Progress
 from tests.commanding import command
@@ -137,6 +140,25 @@ def test_a_run_starts_from_what_another_has_learned(kind: str, tmp_path: Path) -
         space_dist.train(fresh, out=tmp_path / "second", resume=True, progress=False)
 
 
+@pytest.mark.parametrize("engine", ["single", "population"])
+def test_a_grid_keeps_what_its_runs_start_from(engine: str, tmp_path: Path) -> None:
+    config = config_for(tmp_path, learner_section("ppo"))
+    first = space_dist.train(config, out=tmp_path / "first", progress=False)
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
+    (tmp_path / "grid.yaml").write_text(
+        f"name: from_first\nextends: run.yaml\nset: {{ init_from: first, engine: {engine} }}\nseeds: [0]\n"
+        "tracking: { uri: null }\n"
+    )
+    plan(tmp_path / "grid.yaml", tmp_path / "runs")
+    learned = first.evaluations[-1]["test"]["returns"]
+    shutil.rmtree(first.folder)
+    grid = space_dist.run_grid(tmp_path / "runs/from_first", max_parallel=1, progress=False)
+    assert grid.complete, grid.statuses
+    for run in grid.runs().values():
+        np.testing.assert_allclose(run.evaluations[0]["test"]["returns"], learned, rtol=1e-6)
+    assert grid.report().numbers[0]["runs"] == 1
+
+
 def test_networks_that_do_not_fit_are_refused_with_what_differs(tmp_path: Path) -> None:
     space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "first", progress=False)
     for section, reason in (
@@ -182,7 +204,7 @@ def test_a_config_is_a_path_a_mapping_or_itself(tmp_path: Path, monkeypatch: pyt
 
 def test_train_does_what_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_for(tmp_path, learner_section("ppo"))
-    (tmp_path / "run.yaml").write_text(space_dist.config.dump(config))
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
     assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", tmp_path / "told") == 0
     run = space_dist.train(tmp_path / "run.yaml", out=tmp_path / "called")
     assert files(tmp_path / "told") == files(run.folder)
