@@ -48,8 +48,9 @@ from space_dist.run.training import Progress, Training
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import fingerprint
-from space_dist.system.workplace import absolute_uri, private_ray
+from space_dist.system.workplace import private_ray
 from space_dist.tracking.pusher import Pusher
+from space_dist.tracking.settling import settled
 
 log = logging.getLogger("space_dist")
 
@@ -150,7 +151,7 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
     ledger, spec = Ledger(folder), spec_of(config)
-    config = resolved(config, spec)
+    config = resolved(config, spec).model_copy(update={"tracking": settled(config.tracking, "space_dist")})
     train, test = read_instances(config, spec.context_bounds)
     setup = make_setup(config, spec, train, test)
     refuse_machine(config)
@@ -326,7 +327,6 @@ def _self_contained(config: RunConfig) -> RunConfig:
     return config.model_copy(
         update={
             "instances": config.instances.model_copy(update=instances),
-            "tracking": config.tracking.model_copy(update={"uri": absolute_uri(config.tracking.uri)}),
         }
     )
 
@@ -472,12 +472,10 @@ def _logging_to(path: Path) -> Iterator[None]:
 
 
 def _start_pusher(config: RunConfig, ledger: Ledger) -> Pusher | None:
-    if config.tracking.uri is None or not config.tracking.live:
+    if not (config.tracking.anywhere and config.tracking.live):
         return None
     try:
-        return Pusher(config.tracking.uri, ledger.folder, ledger.folder / "tracking.log")
+        return Pusher(config.tracking, ledger.folder, ledger.folder / "tracking.log")
     except OSError as error:
-        log.warning(
-            "nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", in_words(error)
-        )
+        log.warning("nothing is mirrored while the run trains: %s. `space-dist sync` can do it later", in_words(error))
         return None

@@ -272,7 +272,7 @@ def _values(grid: Export) -> dict[str, Any]:
         "root": None if grid.root is None else str(grid.root), "log_folders": grid.log_folders(), "jobs": JOBS,
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
-        "sync": manifest.tracking.uri is not None,
+        "sync": manifest.tracking.anywhere,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
         "env": {_Safe(name): value for name, value in profile.env.items()},
         "modules": profile.modules, "venv": profile.venv, "conda": profile.conda,
