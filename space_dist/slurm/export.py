@@ -74,6 +74,19 @@ class Export:
         """Of an array task, or of each node."""
         return self.profile.cpus_per_task or self.manifest.cpus_per_run
 
+    def tracking_remark(self, folder: Path) -> str | None:
+        """What is to be known of the MLflow that scripts in `folder` carry: a file that may be this machine's own."""
+        uri = self.manifest.tracking.uri
+        results = (self.root or folder).absolute()
+        if uri is None or not uri.startswith("sqlite:") or Path(uri.removeprefix("sqlite:///")).is_relative_to(results):
+            return None
+        return (
+            f"tracking.uri: {uri} is a file outside of {results}: where the job that gathers the results does not see "
+            "it, it makes another one there. Set tracking.uri in the grid's file, or MLFLOW_TRACKING_URI, to "
+            f"http(s)://HOST:PORT or sqlite:///{results}/mlflow.db, and export again; or tracking.uri: null, and "
+            "`space-dist sync` later"
+        )
+
     @property
     def n_runs(self) -> int:
         """All of the grid's."""

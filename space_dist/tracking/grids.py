@@ -345,7 +345,7 @@ class GridMirror:
 
 def _ending(looks: Sequence[Look]) -> tuple[str, Counter[str]]:
     """How runs stand together, in MLflow's words, and how many of them in which condition."""
-    counts = Counter(look.run_status.condition for look in looks)
+    counts = Counter[str](look.run_status.condition for look in looks)
     if counts["running"] or counts["waiting"]:
         return "RUNNING", counts
     return ("FAILED" if counts["failed"] else "FINISHED"), counts
