@@ -96,7 +96,7 @@ def interrupted(folder: Path, uri: str, *seeds: int) -> Grid:
 
 
 @pytest.fixture(autouse=True)
-def reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def reports(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The grids that were reported on, with a page instead of a report: drawing takes seconds."""
     made: list[Path] = []
 
@@ -104,8 +104,7 @@ def reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         made.append(grid.folder)
         (out / "report.html").write_text("a report")
 
-    if "real_report" not in request.keywords:
-        monkeypatch.setattr("space_dist.report.build_grid_report", write)
+    monkeypatch.setattr("space_dist.report.build_grid_report", write)
     return made
 
 

@@ -366,7 +366,7 @@ def _of_cell(manifest: Manifest, cell: Cell, grid_key: str) -> dict[str, str]:
 def _place(cell: Cell) -> str:
     """A cell's folder among those of a sink: its label, as far as that is plain."""
     plain = re.sub(r"[^A-Za-z0-9=_,. -]", "_", cell.label).strip(". ")
-    return plain if plain == cell.label else f"{plain} {cell.id}".strip()
+    return plain if plain and plain == cell.label else f"{plain} {cell.id}".strip()
 
 
 def _plan_params(manifest: Manifest) -> dict[str, str]:

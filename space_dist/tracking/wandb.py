@@ -61,4 +61,4 @@ class WeightsAndBiases:
             for (milliseconds, step), numbers in rows.items():
                 run.log({**numbers, "steps": step, "time/unix": milliseconds / 1000.0})
         finally:
-            run.finish(exit_code=0 if record.mlflow_status == "FINISHED" else 1, quiet=True)
+            run.finish(exit_code=0 if record.mlflow_status == "FINISHED" else 1)
