@@ -17,8 +17,8 @@ from space_dist.arithmetic import digest, scipy_checks
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import METRICS, Ledger
 from space_dist.run import ray_actors
-from space_dist.run.building import learner_of, make_setup, spec_of
-from space_dist.run.launch import launch, read_instances
+from space_dist.run.building import Blueprint
+from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.patience import PATIENCE
 from tests.test_distributed import ROOT, cluster_class, config, reference, results  # noqa: F401
@@ -31,10 +31,10 @@ def test_rollout_actors_of_mlp_policies_never_import_torch(cluster_class: Any) -
     import ray
 
     run = config(1)
-    spec = spec_of(run)
-    setup = make_setup(run, spec, *read_instances(run, spec.context_bounds))
+    blueprint = Blueprint.of(run)
+    setup = blueprint.setup(*blueprint.instances())
     with cluster_class(run, setup) as cluster:
-        policy = cluster.put(learner_of(run, spec).policy(0))
+        policy = cluster.put(blueprint.learner().policy(0))
         decision = cluster.begin(cluster.start_values(policy))
         from space_dist.rollout.walk import Walk
 
@@ -108,8 +108,8 @@ def test_actors_are_compared_by_all_that_they_compute_with(
 ) -> None:  # fmt: skip
     policy = {"policy": "MultiInputPolicy"} if env_id.endswith("dict") else {}
     config = config_for(tmp_path, learner_section("ppo", **policy), env_id)
-    spec = spec_of(config)
-    setup = make_setup(config, spec, *read_instances(config, spec.context_bounds))
+    blueprint = Blueprint.of(config)
+    setup = blueprint.setup(*blueprint.instances())
     shipped = configs.load(ROOT / "configs/pointmass_space.yaml", [f"curriculum={{kind: {kind}}}"])
     config = config.model_copy(update={"curriculum": shipped.curriculum})
     for wanted, is_central in ((rollout, False), (central, True)):

@@ -212,7 +212,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert len(done.stdout.splitlines()) == 1  # quiet when not a terminal
+    assert len(done.stdout.splitlines()) <= 5  # of progress little where nobody looks on
     return folder
 
 
@@ -384,3 +384,78 @@ def test_sampled_instances_are_checked_and_never_overwritten(
     assert run(capsys, "instances", "check", *files)[0] == 0
     code, _, error = run(capsys, *sampled)
     assert (code, "exists" in error) == (2, True)
+
+
+def test_a_grid_is_told_from_a_run(capsys: pytest.CaptureFixture[str]) -> None:
+    grid = ROOT / "configs/grids/quickstart.yaml"
+    code, _, said = run(capsys, "train", grid)
+    assert (code, said) == (2, f"space-dist: {grid} is a grid, of many runs: space-dist grid run {grid}\n")
+    code, _, said = run(capsys, "grid", "run", CONFIG)
+    assert code == 2
+    assert said.startswith(f"space-dist: {CONFIG} is the config of one run: space-dist train {CONFIG}")
+
+
+def test_the_schema_can_be_asked_for_a_part(capsys: pytest.CaptureFixture[str]) -> None:
+    code, whole, _ = run(capsys, "config", "schema")
+    assert code == 0
+    _, gamma, _ = run(capsys, "config", "schema", "gamma")
+    assert "learner (ppo)" in gamma
+    assert {line.split(":")[0].strip() for line in gamma.splitlines() if line.startswith("  learner")} == {
+        "learner.gamma"
+    }
+    _, kind, _ = run(capsys, "config", "schema", "plr")
+    assert "curriculum.temperature" in kind
+    assert "curriculum.kappa" not in kind
+    assert len(kind) < len(whole) / 10
+    code, _, said = run(capsys, "config", "schema", "gamm_")
+    assert (code, said) == (2, "space-dist: config schema: no key has 'gamm_' in it; did you mean 'gamma'?\n")
+
+
+def test_a_pipe_is_told_what_a_run_does(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    settings = [part for setting in SMALL for part in ("--set", setting)]
+    code, said, _ = run(capsys, "train", CONFIG, *settings, "--out", tmp_path / "run")
+    assert code == 0
+    lines = said.splitlines()
+    assert lines[0] == "pointmass_space s0: preparing the learner"
+    assert lines[1].startswith("pointmass_space s0: 256/4,096 steps")
+    assert lines[-2].startswith("pointmass_space s0: 4,096/4,096 steps")
+    assert lines[-1].startswith("pointmass_space, seed 0: done, 4,096 environment steps.")
+
+
+def test_cells_never_look_alike_however_narrow_the_terminal(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = tmp_path / "wide.yaml"
+    grid.write_text(
+        f"name: wide\nextends: {os.path.relpath(CONFIG, tmp_path)}\ngrid:\n"
+        "  learner.learning_rate: [1.0e-4, 3.0e-4]\n  learner.gae_lambda: [0.95, 0.99]\n  curriculum:\n"
+        "    - {kind: space, eta: 0.05, kappa: 16, mean: mean_abs_change}\n"
+        "    - {kind: space, eta: 0.05, kappa: 32, mean: mean_abs_change}\n"
+        "seeds: [0]\n"
+    )
+    for width in (40, 80, 200):
+        monkeypatch.setattr(terminal.console, "width", width)
+        code, said, _ = run(capsys, "grid", "plan", grid, "--root", tmp_path)
+        assert code == 0
+        for rate in ("0.0001", "0.0003"):
+            for lambda_ in ("0.95", "0.99"):
+                for kappa in (16, 32):
+                    label = (
+                        f"learning_rate={rate} gae_lambda={lambda_} space eta=0.05 kappa={kappa} mean=mean_abs_change"
+                    )
+                    assert said.count(label) == 1
+
+
+def test_time_left_is_told_by_the_rate_of_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from space_dist.cli import overview
+    from space_dist.experiment.manifest import Grid
+    from space_dist.grid.conductor import Overview
+
+    now = [100.0]
+    monkeypatch.setattr(overview.time, "monotonic", lambda: now[0])
+    left = overview._TimeLeft(Grid(tmp_path))
+    assert left.in_words(Overview(4, 4000)) == ""
+    now[0] += 60.0
+    assert left.in_words(Overview(4, 3000, done=1)) == ", about 0:03:00 left"
+    now[0] += 60.0
+    assert left.in_words(Overview(4, 0, done=4)) == ""

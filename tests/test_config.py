@@ -679,7 +679,7 @@ def candidates(config: RunConfig, key: str, value: Any) -> list[Any]:
     if isinstance(value, int | float):
         return [value * 2 or 1, value / 2 or 0.5, *words]
     if isinstance(value, list):
-        return [[32, 32], ["effort"]]
+        return [[32, 32], ["effort"], ["wandb"]]
     return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1, [0.5, 0.5], ["a"]]
 
 
@@ -813,3 +813,55 @@ def test_learners_say_what_they_can_do() -> None:
                 if load(SPACE, [f"learner.update={update}"]).learner.is_compiled(engine)]  # fmt: skip
     assert compiled == [("stock", "population"), ("lean", "single"), ("lean", "population")]
     assert not CONFIGS["learner_trpo"].learner.is_compiled("population")
+
+
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        ([], (4, 4)),
+        (["rollout=auto"], (4, 4)),
+        (["learner.n_steps=1000"], (4, 2)),
+        (["learner.n_steps=50", "learner.batch_size=10"], (2, 1)),
+        (["learner.n_steps=1001"], (1, 1)),
+        (["learner.n_steps=1000", "rollout={shards: auto, slots: 5}"], (4, 5)),
+        (["learner.n_steps=96", "rollout={shards: 8}"], (8, 4)),
+        (["learner.n_steps=72", "rollout={shards: 8}"], (8, 3)),
+    ],
+)
+def test_shards_and_slots_that_fit_are_found(settings: list[str], found: tuple[int, int], tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    text = "\n".join(line for line in SPACE.read_text().splitlines() if "shards:" not in line and "slots:" not in line)
+    file.write_text(text.replace("rollout:\n", "").replace("instances/", f"{SPACE.parent}/instances/"))
+    rollout = load(file, settings).rollout
+    assert (rollout.shards, rollout.slots) == found
+
+
+def test_numbers_that_do_not_fit_are_answered_with_some_that_do() -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(SPACE, ["learner.n_steps=1001"])
+    text = str(refusal.value)
+    assert "rollout: auto (1 and 1 here), or learner.n_steps: 992 or 1008" in text
+    for n_steps in (992, 1008):
+        assert load(SPACE, [f"learner.n_steps={n_steps}"]).rollout.shards == 4
+    with pytest.raises(ConfigError, match=r"Use budget\.steps: 2048 or more"):
+        load(SPACE, ["budget.steps=1"])
+
+
+@pytest.mark.parametrize(
+    ("key", "ours"),
+    [
+        ("learner.lr", "learner.learning_rate"),
+        ("n_envs", "rollout.shards"),
+        ("learner.total_timesteps", "budget.steps"),
+    ],
+)
+def test_words_of_stable_baselines3_are_translated(key: str, ours: str) -> None:
+    with pytest.raises(ConfigError, match=f"What Stable-Baselines3 calls {key.rpartition('.')[2]} is {ours}"):
+        load(SPACE, [f"{key}=4"])
+
+
+@pytest.mark.parametrize("workers", ["-1", "4097", "some"])
+def test_workers_are_a_number_or_auto(workers: str) -> None:
+    with pytest.raises(ConfigError, match=r"resources\.workers"):
+        load(SPACE, [f"resources.workers={workers}"])
+    assert load(SPACE, ["resources.workers=auto"]).resources.workers == "auto"

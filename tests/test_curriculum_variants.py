@@ -24,7 +24,7 @@ from space_dist.curricula.making import make_curriculum
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
-from space_dist.run.building import make_setup, spec_of
+from space_dist.run.building import Blueprint, spec_of
 from space_dist.run.cluster import Central
 from tests.test_curricula import as_plain, drive, feedback, make_set, shown, stored_and_restored
 
@@ -554,7 +554,7 @@ def set_up(curriculum: str, *overrides: str) -> None:
     config = config_with(curriculum, *overrides)
     spec = spec_of(config)
     train, test = (read_csv(path, spec.context_bounds) for path in (config.instances.train, config.instances.test))
-    make_setup(config, spec, train, test)
+    Blueprint(config, spec).setup(train, test)
 
 
 def test_unknown_ids_are_refused_when_the_run_starts():

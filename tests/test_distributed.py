@@ -14,8 +14,8 @@ import pytest
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
 from space_dist.ledger import CURRICULUM, METRICS
-from space_dist.run.building import make_setup, spec_of
-from space_dist.run.launch import launch, read_instances
+from space_dist.run.building import Blueprint
+from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import private_ray
 from tests.patience import PATIENCE
@@ -147,5 +147,5 @@ def test_rays_of_our_own_start_one_at_a_time(tmp_path: Path, monkeypatch: pytest
 
 
 def _setup(run: configs.RunConfig) -> Any:
-    spec = spec_of(run)
-    return make_setup(run, spec, *read_instances(run, spec.context_bounds))
+    blueprint = Blueprint.of(run)
+    return blueprint.setup(*blueprint.instances())

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from space_dist import config as configs
 from space_dist.cli import app
 from space_dist.config import to_yaml
 from space_dist.envs import BatchedSingles, close, make_batched
@@ -25,6 +26,8 @@ from space_dist.envs.interface import Closable, FloatArray, IntArray, Observatio
 from space_dist.envs.spec import read_spec
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.grid.planning import plan
+from space_dist.run import cluster
+from space_dist.run.building import spec_of
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.faulty_env import Honest
@@ -33,6 +36,8 @@ from tests.patience import PATIENCE
 from tests.test_learners import RESULTS, config_for, interrupted, learner_section, run
 from tests.test_population import configured, together
 from tests.tiny_env import Line
+
+ROOT = Path(__file__).resolve().parent.parent
 
 POINTMASS, BULLET, SINGLE = "space_dist/PointMass-v0", "space_dist/BallCatching-v0", "tests.faulty_env:Honest"
 COUNTED = "tests.test_environment_spec:make_counted"
@@ -327,3 +332,20 @@ def test_a_grid_is_planned_with_one_look_at_each_environment(tmp_path: Path) -> 
     made = plan(write_grid(tmp_path, set=settings, grid=axes), tmp_path / "runs")
     assert len(made.manifest.cells) == 6
     assert (Counted.made, Counted.opened) == ([1, 1], set())
+
+
+def test_actors_are_started_where_slots_are_stepped_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "cores", lambda: 4)
+    together, one_by_one = (
+        configs.load(ROOT / "configs/pointmass_space.yaml"),
+        configs.load(ROOT / "configs/antgoal_space.yaml"),
+    )
+    assert cluster.n_workers(together, spec_of(together)) == 0
+    spec = spec_of(one_by_one)
+    assert cluster.n_workers(one_by_one, spec) == 3
+    monkeypatch.setattr(cluster, "cores", lambda: 1)
+    assert cluster.n_workers(one_by_one, spec) == 1
+    told = configs.load(ROOT / "configs/antgoal_space.yaml", ["resources.workers=0"])
+    assert cluster.n_workers(told, spec) == 0
+    joined = configs.load(ROOT / "configs/pointmass_space.yaml", ["resources.address=auto"])
+    assert cluster.n_workers(joined, spec_of(joined)) == 1

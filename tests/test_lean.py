@@ -21,7 +21,7 @@ from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
 from space_dist.learner import lean, make_learner
 from space_dist.learner.lean import LeanBuffer
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
-from space_dist.run.building import resolved, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.run.training import Progress
 from space_dist.system.interrupts import StopRequests
@@ -343,8 +343,8 @@ def test_a_population_has_an_update_of_its_own() -> None:
     with pytest.raises(ConfigError, match=r"learner\.update: lean says nothing with engine: population"):
         configs.load(SPACE, [*overrides, "engine=population"])
     lean, stock = (configs.load(SPACE, [*some, "engine=auto"]) for some in (overrides, ()))
-    assert resolved(lean, spec_of(lean)).engine == "single"
-    assert resolved(stock, spec_of(stock)).engine == "population"
+    assert Blueprint.of(lean).config.engine == "single"
+    assert Blueprint.of(stock).config.engine == "population"
 
 
 def test_the_update_is_part_of_what_a_run_is_and_stock_changes_no_identity() -> None:

@@ -18,7 +18,7 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner import lean_replay, make_learner
 from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
-from space_dist.run.building import resolved, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.test_lean import Casting, assert_resumed_to_the_same_bytes, close
@@ -295,13 +295,12 @@ def test_a_run_that_is_stopped_and_resumed_is_the_same_byte_for_byte(kind: str, 
 
 @pytest.mark.ray
 @pytest.mark.usefixtures("one_ray")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["dqn", "sac"])  # discrete actions, and continuous ones
 def test_the_number_of_workers_changes_no_byte(kind: str, tmp_path: Path) -> None:
-    for workers in (0, 1, 2):
+    for workers in (0, 2):
         launch(run_config(kind, tmp_path, workers), tmp_path / str(workers), resume=False, stop=StopRequests())
     for name in RESULTS:
-        alone = (tmp_path / "0" / name).read_bytes()
-        assert all((tmp_path / str(workers) / name).read_bytes() == alone for workers in (1, 2)), name
+        assert (tmp_path / "2" / name).read_bytes() == (tmp_path / "0" / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -361,7 +360,7 @@ def test_numba_that_may_not_compile_is_told(kind: str, monkeypatch: pytest.Monke
 
 def test_there_is_no_population_of_it() -> None:
     config = configs.load(CARTPOLE, ["learner.update=lean", "engine=auto"])
-    assert resolved(config, spec_of(config)).engine == "single"
+    assert Blueprint.of(config).config.engine == "single"
     with pytest.raises(ConfigError, match=r"engine: population learns with learner\.kind: ppo or trpo, not dqn"):
         learners.refuse_population(config.learner, spaces.Box(-1.0, 1.0, (3,)), spaces.Discrete(2))
 

@@ -14,7 +14,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
-from space_dist.curricula.making import make_curriculum
 from space_dist.envs.interface import Step
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.learner import CoupledLearner
@@ -22,8 +21,8 @@ from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.rollout import Shard, Worker, collecting
 from space_dist.rollout.policy import policies_of
 from space_dist.rollout.walk import Walk
-from space_dist.run.building import learner_of, make_setup, memory_of, spec_of
-from space_dist.run.launch import Outcome, launch, policy_of, read_instances
+from space_dist.run.building import Blueprint
+from space_dist.run.launch import Outcome, launch, policy_of
 from space_dist.run.population import advance, member
 from space_dist.system.interrupts import StopRequests
 from tests.grids import ROOT
@@ -151,7 +150,7 @@ def test_what_a_member_takes_of_the_memory_is_foreseen(kind: str, tmp_path: Path
     few, many = map(int, said.split())
     each = (many - few) / 8 / 2**20
     config = load(path)
-    assert each <= memory_of(config, spec_of(config)) <= 3 * each
+    assert each <= Blueprint.of(config).memory <= 3 * each
 
 
 def test_a_member_that_is_asked_to_stop_stops_alone(tmp_path: Path) -> None:
@@ -235,15 +234,14 @@ def test_policies_that_share_a_curriculum_are_one_run(tmp_path: Path) -> None:
 
 def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> None:
     config = coupled(tmp_path)
-    spec = spec_of(config)
-    setup = make_setup(config, spec, *read_instances(config, spec.context_bounds))
-    learner = learner_of(config, spec)
+    blueprint = Blueprint.of(config)
+    setup, learner = blueprint.setup(*blueprint.instances()), blueprint.learner()
     assert isinstance(learner, CoupledLearner)
     policy, worker = learner.policy(0), Worker(setup)
     own = [worker.start_values(member, 0) for member in policy.policies]
     assert np.array_equal(worker.start_values(policy, 0), np.mean(own, axis=0))
     assert not np.array_equal(own[0], own[1])
-    selection = make_curriculum(config, setup.train, spec.context_bounds).start()[1]
+    selection = blueprint.curriculum(setup.train).start()[1]
     asked = {"round": 0, "steps": 0, "selection_version": 0}
     shards = [worker.collect(policy, selection, Walk(-1, ()), shard=number, **asked) for number in range(setup.shards)]
     single = Worker(dataclasses.replace(setup, policies=1))
@@ -251,7 +249,7 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
         member = policy.policies[number // 4]
         again = single.collect(member, selection, Walk(-1, ()), shard=number, **asked)
         assert np.array_equal(shard.actions, again.actions)
-    alone = learner_of(config, spec)
+    alone = blueprint.learner()
     assert isinstance(alone, CoupledLearner)
     before = learner.scored()
     update = learner.update(shards, round=0, steps=3 * N_STEPS)
@@ -301,13 +299,13 @@ def test_their_evaluation_is_the_mean_of_theirs(tmp_path: Path) -> None:
     config = coupled(tmp_path, evaluation={"every_steps": 100, "episodes": 2})
     alone(config, tmp_path / "run")
     first = Ledger(tmp_path / "run").rows()[0]
-    spec = spec_of(config)
-    learner, setup = learner_of(config, spec), make_setup(config, spec, *read_instances(config, spec.context_bounds))
+    blueprint = Blueprint.of(config)
+    learner, setup = blueprint.learner(), blueprint.setup(*blueprint.instances())
     single = Worker(dataclasses.replace(setup, policies=1, shards=1))
     outcomes = [single.evaluate(member, "test", 0).returns.reshape(-1, 2).mean(axis=1)
                 for member in policies_of(learner.policy(0))]  # fmt: skip
     assert first["test"]["returns"] == pytest.approx(np.mean(outcomes, axis=0).tolist(), abs=1e-6)
-    assert len(policies_of(policy_of(Ledger(tmp_path / "run"), spec))) == 3
+    assert len(policies_of(policy_of(Ledger(tmp_path / "run"), blueprint.spec))) == 3
 
 
 @pytest.mark.parametrize(

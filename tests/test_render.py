@@ -21,7 +21,7 @@ from space_dist.instances import InstanceSet
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, RunWriter, Status
 from space_dist.rollout import Worker
 from space_dist.rollout.policy import MlpPolicy, to_arrays
-from space_dist.run.building import learner_of, make_setup, spec_of
+from space_dist.run.building import Blueprint, spec_of
 from space_dist.run.launch import policy_of
 from space_dist.run.render import END_MILLISECONDS, MAX_FRAMES, draw_run
 from space_dist.tracking import drawing, sync
@@ -45,7 +45,7 @@ def run_of(
         "rollout": {"shards": 1, "slots": 1}, "budget": {"steps": 2048}, "tracking": {"uri": None},
     }  # fmt: skip
     config = configs.parse(data, "test")
-    policy = learner_of(config, spec_of(config)).policy(0)
+    policy = Blueprint.of(config).learner().policy(0)
     assert isinstance(policy, MlpPolicy)
     if bias is not None:
         matrix, _ = policy.actor[-1]
@@ -113,7 +113,7 @@ def test_episodes_are_those_of_the_runs_evaluation(tmp_path: Path) -> None:
     names = ("gate_x", "gate_width", "friction")
     sets = [InstanceSet(np.arange(2) + start, contexts[start : start + 2], names) for start in (0, 2)]
     spec = spec_of(config)
-    worker = Worker(make_setup(config, spec, *sets))
+    worker = Worker(Blueprint(config, spec).setup(*sets))
     expected = {split: worker.evaluate(policy_of(ledger, spec), split, 0) for split in ("train", "test")}
     written = draw_run(ledger, tmp_path / "pictures", [3, 0, 1, 2])
     for (path, what), (split, place) in zip(

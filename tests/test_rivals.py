@@ -47,7 +47,7 @@ from space_dist.rollout import Setup, Shard, Worker
 from space_dist.rollout.episodes import mean_sizes
 from space_dist.rollout.policy import EnsemblePolicy, Statistics
 from space_dist.rollout.walk import Walk
-from space_dist.run.building import make_setup, spec_of
+from space_dist.run.building import Blueprint, spec_of
 from space_dist.run.launch import launch
 from space_dist.seeding import Purpose, generator
 from space_dist.system.interrupts import StopRequests
@@ -157,7 +157,7 @@ def tiny_shards(config: configs.RunConfig, seed: int = 0) -> tuple[Worker, Any, 
     """A worker, a learner, and a round that they collected on the line of `tests.tiny_env`."""
     line = InstanceSet(np.arange(3), np.array([[-0.5], [0.0], [0.5]]), ("target",))
     test = InstanceSet(np.array([9]), np.array([[0.25]]), ("target",))
-    setup: Setup = make_setup(config, spec_of(config), line, test)
+    setup: Setup = Blueprint.of(config).setup(line, test)
     spec = setup.spec
     learner = make_learner(
         config.learner, spec.observation_space, spec.action_space, seed=seed, n_slots=4, slot_length=32, total_steps=512
@@ -853,7 +853,7 @@ def set_up(*overrides: str) -> None:
     middle = (bounds.low + bounds.high) / 2.0
     contexts = middle + np.linspace(-0.1, 0.1, 30)[:, None] * np.random.default_rng(0).random((30, len(middle)))
     train = InstanceSet(np.arange(30), contexts, bounds.names)
-    make_setup(config, spec, train, InstanceSet(np.array([99]), middle[None], bounds.names))
+    Blueprint(config, spec).setup(train, InstanceSet(np.array([99]), middle[None], bounds.names))
 
 
 class Silent(Line):
@@ -909,7 +909,7 @@ def test_contexts_of_instances_are_worth_what_their_start_values_say() -> None:
     spec = spec_of(still)
     bounds = spec.context_bounds
     train, test = (read_csv(path, bounds) for path in (still.instances.train, still.instances.test))
-    point = Worker(make_setup(still, spec, train, test))
+    point = Worker(Blueprint(still, spec).setup(train, test))
     policy = make_learner(
         still.learner, spec.observation_space, spec.action_space, seed=0, n_slots=16, slot_length=128, total_steps=2048
     ).policy(0)

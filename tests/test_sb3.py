@@ -39,7 +39,7 @@ from space_dist.instances import InstanceSet
 from space_dist.learner import SB3Learner
 from space_dist.ledger import Checkpoint, decode_checkpoint
 from space_dist.rollout import Outcomes, Shard
-from space_dist.run.building import learner_of, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.run.launch import begun
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
@@ -116,7 +116,7 @@ def run_config(
 def witnessed(config: RunConfig, folder: Path) -> Witness:
     """Our own loop's run of a config."""
     with begun(config, folder, resume=False, stop=StopRequests()) as active:
-        witness = Witness(active.config, active.setup)
+        witness = Witness(active.blueprint.config, active.setup)
         training = active.training(witness)
         assert isinstance(training.learner, SB3Learner)
         witness.learner, update = training.learner, training.learner.update
@@ -137,7 +137,7 @@ def replay(config: RunConfig, witness: Witness, callback: CurriculumCallback) ->
 
     What the environment answers must be the same then, and every selection, and the values behind it.
     """
-    twin = learner_of(config, spec_of(config))
+    twin = Blueprint.of(config).learner()
     assert isinstance(twin, SB3Learner)
     model = twin.model
     instances = InstanceSet(np.arange(len(TARGETS)) + 10, TARGETS[:, None], ("target",))

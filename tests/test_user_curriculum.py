@@ -19,8 +19,8 @@ from space_dist.cli import runs
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.grid.planning import plan
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, RunWriter
-from space_dist.run.building import make_setup, spec_of
-from space_dist.run.launch import launch, read_instances
+from space_dist.run.building import Blueprint
+from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.patience import PATIENCE
@@ -181,9 +181,9 @@ def test_columns_of_the_instances_reach_it(example: Path) -> None:
 @pytest.mark.usefixtures("example")
 def test_what_cannot_be_made_is_refused_before_the_run(curriculum: str, words: str) -> None:
     config = chosen(f"curriculum={{kind: custom, {curriculum}}}")
-    spec = spec_of(config)
+    blueprint = Blueprint.of(config)
     with pytest.raises(ConfigError) as refusal:
-        make_setup(config, spec, *read_instances(config, spec.context_bounds))
+        blueprint.setup(*blueprint.instances())
     assert words in str(refusal.value)
 
 

@@ -21,7 +21,7 @@ from space_dist.cli import runs
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.grid.planning import plan
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, RunWriter
-from space_dist.run.building import resolved, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.sb3.export import export_sb3
 from space_dist.system.interrupts import StopRequests
@@ -311,9 +311,9 @@ def test_a_class_of_a_library_that_a_module_imports_is_refused(example: Path) ->
 @pytest.mark.usefixtures("example")
 def test_auto_engine_leaves_it_alone() -> None:
     config = chosen("engine=auto")
-    assert resolved(config, spec_of(config)).engine == "single"
+    assert Blueprint.of(config).config.engine == "single"
     stock = chosen("engine=auto", "learner.import=null", "learner.kwargs={}")
-    assert resolved(stock, spec_of(stock)).engine == "population"
+    assert Blueprint.of(stock).config.engine == "population"
 
 
 KINDS = {"ppo": "stable_baselines3", "a2c": "stable_baselines3", "trpo": "sb3_contrib", "sac": "stable_baselines3",

@@ -191,10 +191,8 @@ def measure(task: Task, contender: Contender, seconds: float, clock: Callable[[]
 def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     from space_dist.errors import Interrupted
     from space_dist.ledger import Ledger
-    from space_dist.run.launch import launch
-    from space_dist.run.training import Progress
-    from space_dist.system.interrupts import StopRequests
 
+    launch, stop = _ours_of("run/launch", "launch").launch, _ours_of("system/interrupts", "interrupts").StopRequests()
     slots = [f"rollout.slots={contender.slots}"] if contender.slots else []
     config = task.run_config(
         f"learner.update={contender.update}", f"resources.workers={contender.workers}",
@@ -203,17 +201,26 @@ def _ours(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     with tempfile.TemporaryDirectory() as folder:
         run, seen = Path(folder) / "run", [-1]
 
-        def observe(progress: Progress) -> None:
+        def observe(progress: Any) -> None:
             if progress.steps > seen[0]:
                 seen[0] = progress.steps
                 if watch.mark(progress.steps):
                     Ledger(run).stop_file.touch()
 
         try:
-            launch(config, run, resume=False, stop=StopRequests(), observe=observe)
+            launch(config, run, resume=False, stop=stop, observe=observe)
         except Interrupted:
             return
         raise RuntimeError("the run ended before it was measured")
+
+
+def _ours_of(*files: str) -> Any:
+    """A module of the version that is measured, by where it may lie there: newest first."""
+    package = Path(configs.__file__).parents[0 if Path(configs.__file__).name == "config.py" else 1]
+    for file in files:
+        if (package / f"{file}.py").exists():  # asked of the folder: another version's may be importable, too
+            return importlib.import_module(f"{package.name}.{file.replace('/', '.')}")
+    raise RuntimeError(f"{package} has none of {', '.join(files)}")
 
 
 class _Measured(Exception):  # noqa: N818 - no error
@@ -222,15 +229,14 @@ class _Measured(Exception):  # noqa: N818 - no error
 
 def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     """Runs side by side in this process, marked where the last of them has collected."""
-    from space_dist.run.population import advance, member
-    from space_dist.run.training import Learn
-    from space_dist.system.interrupts import StopRequests
+    population, training = _ours_of("run/population", "population"), _ours_of("run/training", "training")
+    stop = _ours_of("system/interrupts", "interrupts").StopRequests()
 
     def watched(work: Any) -> Iterator[Any]:
         answer: Any = None
         while True:
             request = work.send(answer)
-            if isinstance(request, Learn) and watch.mark(request.steps * contender.members):
+            if isinstance(request, training.Learn) and watch.mark(request.steps * contender.members):
                 raise _Measured
             answer = yield request
 
@@ -238,14 +244,14 @@ def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
         raise RuntimeError(f"{path} ended before it was measured: {outcome}")
 
     with tempfile.TemporaryDirectory() as folder:
-        stop, works = StopRequests(), dict[Path, Any]()
+        works = dict[Path, Any]()
         for seed in range(contender.members):
             path = Path(folder) / str(seed)
             config = task.run_config("engine=population", f"seed={seed}", *contender.overrides)
-            works[path] = member(config, path, stop=stop)
+            works[path] = population.member(config, path, stop=stop)
         works[path] = watched(works[path])
         try:
-            advance(works, ended)
+            population.advance(works, ended)
         except _Measured:
             return
 

@@ -23,7 +23,7 @@ from space_dist.envs.distributions import sample
 from space_dist.instances import InstanceSet
 from space_dist.ledger import Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray
-from space_dist.run.building import make_setup, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.run.training import Training
 
@@ -92,7 +92,7 @@ class _Timed(InProcess):
     """The cluster of a run without Ray that notes the CPU time of what is done for the curriculum."""
 
     def __init__(self, config: configs.RunConfig, train: InstanceSet, test: InstanceSet) -> None:
-        setup = make_setup(config, spec_of(config), train, test)
+        setup = Blueprint.of(config).setup(train, test)
         super().__init__(config, setup)
         self.setup, self.spent = setup, defaultdict[str, list[float]](list)
         self._searches = config.curriculum.kind == "spdrl"
@@ -143,7 +143,7 @@ def _measured(curriculum: str, iterations: int) -> dict[str, Any]:
     cluster = _Timed(config, train, test)
     status = Status("running", config.name, 0, 0, config.budget.steps, 0, 0.0, 0.0)
     with tempfile.TemporaryDirectory() as folder, RunWriter(Ledger(folder)) as writer:
-        run = Training(config, cluster.setup, cluster, writer, status=status)
+        run = Training(Blueprint.of(config), cluster.setup, cluster, writer, status=status)
         ensemble = run.ensemble
         if ensemble is not None:
             fit = ensemble.update

@@ -18,7 +18,7 @@ from space_dist import config as configs
 from space_dist.curricula import SetState
 from space_dist.envs.distributions import sample
 from space_dist.rollout.walk import Walk
-from space_dist.run.building import learner_of, make_setup, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Central, Evidence, InProcess
 from space_dist.system.workplace import private_ray
 
@@ -70,8 +70,8 @@ def curriculum(
 def ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
     """CPU seconds of one stock PPO update on PointMass: the median of `repeats`."""
     train, test = sample("pointmass_uniform", 100, 100, 0)
-    setup = make_setup(config, spec_of(config), train, test)
-    cluster, learner = InProcess(config, setup), learner_of(config, setup.spec)
+    setup = Blueprint.of(config).setup(train, test)
+    cluster, learner = InProcess(config, setup), Blueprint(config, setup.spec).learner()
     weights = learner.policy(0)
     decision = cluster.begin(cluster.start_values(weights))
     shards = cluster.collect(weights, decision.selection, Walk(-1, ()), round=0, steps=0, version=0)
@@ -80,9 +80,9 @@ def ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:
 
 def _curriculum_row(config: configs.RunConfig, n_instances: int, repeats: int) -> dict[str, float]:
     train, test = sample("pointmass_uniform", n_instances, 1, 0)
-    setup = make_setup(config, spec_of(config), train, test)
+    setup = Blueprint.of(config).setup(train, test)
     cluster, central = InProcess(config, setup), Central(config, train, setup.spec.context_bounds)
-    weights = learner_of(config, setup.spec).policy(0)
+    weights = Blueprint(config, setup.spec).learner().policy(0)
     chunks = cluster.start_values(weights)  # the first time, start observations are made and cached
     before = central.begin(*chunks)[3]
     everything = SetState(version=0, order_version=0, size=n_instances, selected=np.arange(n_instances))
@@ -101,7 +101,7 @@ def _through_ray(config: configs.RunConfig, setup: Any, state: Any, before: Any,
     from space_dist.run.ray_cluster import RayCluster
 
     local = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 1})})
-    weights = learner_of(config, setup.spec).policy(0)
+    weights = Blueprint(config, setup.spec).learner().policy(0)
     with RayCluster(local, setup) as cluster:
         state_handle, before_handle = cluster.put(state), cluster.put(before)
 

@@ -25,10 +25,9 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from space_dist import config as configs
-from space_dist.instances import read_csv
 from space_dist.ledger import METRICS, Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray, IntArray, Split, joined
-from space_dist.run.building import make_setup, spec_of
+from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
 from space_dist.run.training import Training
 
@@ -144,13 +143,12 @@ def _run(rank: str, seed: int, steps: int) -> dict[str, float]:
          "checkpoint.every_rounds=100000", "checkpoint.every_seconds=100000"],
         seed=seed,
     )  # fmt: skip
-    spec = spec_of(config)
-    train, test = (read_csv(path, spec.context_bounds) for path in (config.instances.train, config.instances.test))
-    cluster = _Watched(config, make_setup(config, spec, train, test))
+    blueprint = Blueprint.of(config)
+    cluster = _Watched(config, blueprint.setup(*blueprint.instances()))
     status = Status("running", config.name, seed, 0, config.budget.steps, 0, 0.0, 0.0)
     with tempfile.TemporaryDirectory() as folder, RunWriter(Ledger(folder)) as writer:
         writer.restore()
-        Training(config, cluster.setup, cluster, writer, status=status).run()
+        Training(blueprint, cluster.setup, cluster, writer, status=status).run()
         last = [row for row in Ledger(folder).rows(METRICS) if row["kind"] == "evaluation"][-1]
     return {"held_out": last["test"]["return"], **_numbers(cluster.moments)}
 

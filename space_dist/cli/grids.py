@@ -6,16 +6,13 @@ import contextlib
 import json
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 
 import typer
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
 
+from space_dist.cli.overview import display, print_cells, print_failures, status_json, summary, tell, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.system.files import LogFile
@@ -25,9 +22,7 @@ if TYPE_CHECKING:
 
     from space_dist.experiment.manifest import Grid, Manifest, Run
     from space_dist.experiment.status import RunStatus
-    from space_dist.grid.conductor import Overview
     from space_dist.grid.jobs import Mode, Remote
-    from space_dist.slurm.queue import Queue
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
 
@@ -46,8 +41,6 @@ JobServer = Annotated[
 Seed = Annotated[int, typer.Option(help="The run's seed.")]
 
 _MODES = ("auto", "pool", "jobs")
-_LOG_SECONDS = 30.0
-_SHOWN_RUNS = 12
 _WATCH_SECONDS = 1.0
 _QUEUE_SECONDS = 30.0
 _UNFINISHED = 3
@@ -74,7 +67,7 @@ def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
                       for cell in manifest.cells],
         })  # fmt: skip
         return
-    _print_cells(manifest, found)
+    print_cells(manifest, found)
     say(
         f"{len(manifest.cells)} cells x {len(manifest.seeds)} seeds = {len(found)} runs, {made.steps:,} environment "
         f"steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
@@ -197,13 +190,13 @@ def grid_status(
             queue, asked = queue_of(place.folder), time.monotonic()
         found = _run_statuses(place, manifest)
         if as_json:
-            _print_json(_status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
+            _print_json(status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
             if watch and console.is_terminal:
                 console.clear()
-            _print_cells(manifest, found)
-            _print_failures(found, by_cause)
-            say(_summary(manifest, found) + _workers_in_words(place, queue))
+            print_cells(manifest, found)
+            print_failures(found, by_cause)
+            say(summary(manifest, found) + workers_in_words(place, queue))
         if not watch or output_left() or all(run_status.condition in ("done", "failed") for run_status in found):
             raise typer.Exit(exit_code(found))
         time.sleep(_WATCH_SECONDS)
@@ -338,7 +331,7 @@ def run_frozen(
     with contextlib.ExitStack() as stack:
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
-        observe = stack.enter_context(_display(manifest, place))
+        observe = stack.enter_context(display(manifest, place))
         if address == "local" and local_is_enough(manifest, runs, max_parallel):
             here = stack.enter_context(LocalExecutor(place, manifest, STOP.reason))
             return Conductor(
@@ -428,138 +421,6 @@ def _log_to(place: Grid) -> None:
         handler = LogFile(place.log)
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
         log.addHandler(handler)
-
-
-@contextlib.contextmanager
-def _display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], None]]:
-    """On a terminal a table of what runs now; elsewhere a line now and then."""
-    if console.is_terminal:
-        with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda overview: live.update(_live_table(manifest, place, overview))
-        return
-    logged_at = 0.0
-    logged: tuple[object, ...] = ()
-
-    def observe(overview: Overview) -> None:
-        nonlocal logged_at, logged
-        line = (
-            f"{manifest.name}: {overview.done} of {overview.total} done, {len(overview.running)} running, "
-            f"{overview.waiting} waiting, {overview.failed} failed"
-        )
-        if overview.message:
-            line += f" (last: {overview.message})"
-        news = (overview.done, overview.failed, overview.message)
-        if time.monotonic() - logged_at > _LOG_SECONDS or news != logged:
-            logged_at, logged = time.monotonic(), news
-            say(line)
-
-    yield observe
-
-
-def _live_table(manifest: Manifest, place: Grid, overview: Overview) -> Table:
-    from space_dist.ledger import CURRICULUM
-
-    table = Table(box=None, pad_edge=False, show_header=False)
-    done = overview.done / max(1, overview.total)
-    bar = "█" * round(24 * done) + "░" * (24 - round(24 * done))
-    counts = f"{overview.done} of {overview.total} runs done"
-    counts += f", {overview.failed} failed" if overview.failed else ""
-    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting"))
-    for run in overview.running[:_SHOWN_RUNS]:
-        ledger, line = place.ledger(run), "starting"
-        with contextlib.suppress(SpaceDistError, KeyError, IndexError):
-            rows = ledger.rows(CURRICULUM)
-            evaluations = [row for row in ledger.rows() if row["kind"] == "evaluation"]
-            shown = f"{evaluations[-1]['test']['return']:.1f}" if evaluations else "—"
-            steps = rows[-1]["steps"] if rows else 0
-            size = len(rows[-1]["trained"]) if rows else 0
-            line = f"{steps:>10,} of {run.cell.budget_steps:,} steps   set {size}   test return {shown}"
-        table.add_row(Text(run.title), Text(line))
-    if len(overview.running) > _SHOWN_RUNS:
-        table.add_row("", Text(f"and {len(overview.running) - _SHOWN_RUNS} more"))
-    if overview.message:
-        table.add_row(Text("last", style="red"), Text(overview.message))
-    return table
-
-
-def _print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
-    """One line for each cell: how its seeds stand."""
-    table = Table(title=Text(manifest.name), title_justify="left")
-    for column in ("cell", "id", "done", "running", "waiting", "failed", "steps"):
-        table.add_column(column, justify="left" if column in ("cell", "id") else "right")
-    of_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
-    for run_status in found:
-        of_cell[run_status.run.cell.id].append(run_status)
-    for cell in manifest.cells:
-        counts = Counter(run_status.condition for run_status in of_cell[cell.id])
-        steps = sum(run_status.steps for run_status in of_cell[cell.id])
-        of_all = sum(run_status.budget_steps for run_status in of_cell[cell.id])
-        table.add_row(
-            Text(cell.label), cell.id, f"{counts['done']}/{len(of_cell[cell.id])}",
-            *(str(counts[condition]) if counts[condition] else "" for condition in ("running", "waiting", "failed")),
-            f"{steps / max(1, of_all):.0%} of {of_all:,}",
-        )  # fmt: skip
-    console.print(table)
-
-
-def _print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
-    unwell = [run_status for run_status in found if run_status.cause is not None and run_status.condition != "done"]
-    if by_cause:
-        for cause, count in sorted(Counter(run_status.cause for run_status in unwell if run_status.cause).items()):
-            say(f"{cause.in_words}: {count}")
-            for run_status in unwell:
-                if run_status.cause is cause:
-                    run = run_status.run
-                    say(f"  {run.title} ({run.cell.id}): {run_status.condition}; {_last(run_status)}")
-        return
-    for run_status in unwell[:_SHOWN_RUNS]:
-        say(f"{run_status.run.title}: {run_status.in_words}; {_last(run_status)}")
-    if len(unwell) > _SHOWN_RUNS:
-        say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
-
-
-def _last(run_status: RunStatus) -> str:
-    lines = run_status.detail.splitlines()
-    return lines[0][:300] if lines else "no more is known"
-
-
-def _summary(manifest: Manifest, found: Sequence[RunStatus]) -> str:
-    counts = Counter(run_status.condition for run_status in found)
-    parts = [f"{counts[condition]} {condition}" for condition in ("running", "waiting", "failed") if counts[condition]]
-    other = sum(run_status.other_code for run_status in found)
-    parts += [f"{other} of the done ones by another version of this package"] if other else []
-    return ", ".join([f"{manifest.name}: {counts['done']} of {len(found)} runs done", *parts])
-
-
-def _workers_in_words(place: Grid, queue: Queue | None) -> str:
-    if queue is not None:
-        return f"\n{queue.in_words()}"
-    return "" if place.owner_alive() else "; nobody is working on it now"
-
-
-def tell(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> int:
-    """Say how a grid ended; returns the exit code."""
-    from space_dist.experiment.status import exit_code
-
-    _print_failures(found, by_cause=False)
-    say(f"{_summary(manifest, found)}. {place.folder}")
-    return exit_code(found)
-
-
-def _status_json(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> dict[str, Any]:
-    return {
-        "grid": manifest.name, "folder": str(place.folder), "owner_alive": place.owner_alive(),
-        "counts": dict(Counter(run_status.condition for run_status in found)),
-        "runs": [
-            {
-                "cell": run_status.run.cell.id, "label": run_status.run.cell.label, "seed": run_status.run.seed,
-                "condition": run_status.condition, "cause": run_status.cause, "detail": run_status.detail,
-                "steps": run_status.steps, "budget_steps": run_status.budget_steps, "attempts": run_status.attempts,
-                "other_code": run_status.other_code, "folder": str(run_status.ledger.folder),
-            }
-            for run_status in found
-        ],
-    }  # fmt: skip
 
 
 def _conductor(place: Grid, manifest: Manifest, address: str) -> tuple[Remote, JobDetails]:

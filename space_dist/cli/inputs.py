@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 from space_dist.cli.terminal import Kwargs, Overrides, console, delivered, parse_kwargs, say, write
-from space_dist.errors import ConfigError, about
+from space_dist.errors import ConfigError, about, nearest
 
 instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
 config_app = typer.Typer(no_args_is_help=True, help="Explain and check configs.")
@@ -74,11 +74,19 @@ def instances_check(
 
 
 @config_app.command("schema")
-def config_schema() -> None:
+def config_schema(
+    only: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(
+            metavar="KEY",
+            help="Only keys with these letters (gamma, learner.), or of a section of this kind (space, ppo).",
+        ),
+    ] = None,
+) -> None:
     """Explain every key: type, default, meaning, unit and source."""
     from space_dist.config import schema
 
-    for key, kind, default, text in schema():
+    for key, kind, default, text in schema() if only is None else _about(only):
         if kind == "section":
             console.print(f"\n[bold]{key}[/bold]  {text}", highlight=False)
         else:
@@ -89,6 +97,28 @@ def config_schema() -> None:
     delivered()
 
 
+def _about(asked: str) -> list[tuple[str, str, str, str]]:
+    """Rows of the schema: of keys with these letters, and of sections of this kind. Raises ConfigError for none."""
+    from space_dist.config import schema
+
+    rows = list(schema())
+    found: list[tuple[str, str, str, str]] = []
+    header: tuple[str, str, str, str] | None = None
+    whole = False
+    for row in rows:
+        if row[1] == "section":
+            header, whole = row, row[0].endswith(f" ({asked})")
+            continue
+        inside = header is not None and row[0].startswith(f"{header[0].partition(' ')[0]}.")
+        if asked in row[0] or (inside and whole):
+            found += [header] if inside and header is not None and header not in found else []
+            found.append(row)
+    if not found:
+        keys = {row[0].rpartition(".")[2] for row in rows}
+        raise ConfigError(f"config schema: no key has {asked!r} in it{nearest(asked, keys)}")
+    return found
+
+
 @config_app.command("check")
 def config_check(
     config: Annotated[Path, typer.Argument(help="A run's YAML file.")],
@@ -96,12 +126,11 @@ def config_check(
 ) -> None:
     """Check a config and its instance files, and print it with every default written out."""
     from space_dist import config as configs
-    from space_dist.run.building import make_setup, spec_of
-    from space_dist.run.launch import read_instances
+    from space_dist.run.building import Blueprint
 
     run = configs.load(config, list(overrides or []))
     with about(str(config)):
-        spec = spec_of(run)
-        make_setup(run, spec, *read_instances(run, spec.context_bounds))
+        blueprint = Blueprint.of(run)
+        blueprint.setup(*blueprint.instances())
     print(configs.dump(run), end="")
     delivered()

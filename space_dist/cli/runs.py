@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 _REPORT_WIDTH = 200  # characters
 _GRID_WIDTH = 150
 _MAX_CELLS_SHOWN = 60
+_LINE_SECONDS = 10.0  # between lines of progress
 _YAML = (".yaml", ".yml")
 
 
@@ -52,8 +55,8 @@ def train(
         settings.append(f"resources.workers={workers}")
     run = configs.load(config, settings, seed=seed)
     folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
-    with about(str(config)), _display(run.name, run.seed) as observe:
-        outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe)
+    with about(str(config)), _display(run.name, run.seed) as (observe, waiting):
+        outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe, waiting=waiting)
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
     say(f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}")
@@ -302,15 +305,12 @@ def sync(
 
 
 @contextlib.contextmanager
-def _display(name: str, seed: int) -> Iterator[Callable[[Progress], None]]:
-    """A progress bar on a terminal; nothing anywhere else."""
+def _display(name: str, seed: int) -> Iterator[tuple[Callable[[Progress], None], Callable[[str], None]]]:
+    """Who is told of progress, and of what is waited for: a progress bar on a terminal, lines anywhere else."""
     if not console.is_terminal:
-        yield lambda progress: None
+        yield _lines(f"{name} s{seed}")
         return
     from rich import progress as rich_progress
-
-    def number(value: float | None) -> str:
-        return "—" if value is None else f"{value:.2f}"
 
     bar = rich_progress.Progress(
         rich_progress.TextColumn("[bold]{task.description}"),
@@ -320,14 +320,37 @@ def _display(name: str, seed: int) -> Iterator[Callable[[Progress], None]]:
         console=console,
     )
     with bar:
-        task = bar.add_task(f"{name} s{seed}", total=None, line="starting")
+        task = bar.add_task(f"{name} s{seed}", total=None, line="reading instances and environment")
 
         def observe(progress: Progress) -> None:
-            line = (
-                f"{progress.steps:,}/{progress.budget_steps:,} steps  {progress.steps_per_second:,.0f}/s  "
-                f"set {progress.set_size}/{progress.n_instances}  "
-                f"return train {number(progress.train_return)} test {number(progress.test_return)}"
-            )
-            bar.update(task, completed=progress.steps, total=progress.budget_steps, line=line)
+            bar.update(task, completed=progress.steps, total=progress.budget_steps, line=_in_words(progress))
 
-        yield observe
+        yield observe, lambda what: bar.update(task, line=what)
+
+
+def _lines(title: str) -> tuple[Callable[[Progress], None], Callable[[str], None]]:
+    """The same as lines: what is waited for, and progress now and then."""
+    said_at = -_LINE_SECONDS
+
+    def observe(progress: Progress) -> None:
+        nonlocal said_at
+        now = time.monotonic()
+        if now - said_at < _LINE_SECONDS and progress.steps < progress.budget_steps:
+            return
+        said_at = now
+        rate, left = progress.steps_per_second, progress.budget_steps - progress.steps
+        remaining = f"  {datetime.timedelta(seconds=round(left / rate))} left" if rate > 0 and left > 0 else ""
+        say(f"{title}: {_in_words(progress)}{remaining}")
+
+    return observe, lambda what: say(f"{title}: {what}")
+
+
+def _in_words(progress: Progress) -> str:
+    def number(value: float | None) -> str:
+        return "—" if value is None else f"{value:.2f}"
+
+    return (
+        f"{progress.steps:,}/{progress.budget_steps:,} steps  {progress.steps_per_second:,.0f}/s  "
+        f"set {progress.set_size}/{progress.n_instances}  "
+        f"return train {number(progress.train_return)} test {number(progress.test_return)}"
+    )

@@ -15,6 +15,27 @@ from space_dist.config.run import RunConfig
 from space_dist.config.tracking_uri import UriError
 from space_dist.errors import nearest
 
+# What scripts with SB3 say, and where a config says it.
+_SB3_NAMES = {
+    "lr": "learner.learning_rate",
+    "learning_rate": "learner.learning_rate",
+    "n_envs": "rollout.shards * rollout.slots",
+    "num_envs": "rollout.shards * rollout.slots",
+    "total_timesteps": "budget.steps",
+    "timesteps": "budget.steps",
+    "env_id": "env.id",
+    "env_kwargs": "env.kwargs",
+    "eval_freq": "evaluation.every_steps",
+    "n_eval_episodes": "evaluation.episodes",
+    "tensorboard_log": "tracking",
+    "policy_kwargs": "learner.net_arch, learner.activation and the like",
+    "algo": "learner.kind",
+    "normalize": "learner.normalize_observations and learner.normalize_rewards",
+    "norm_obs": "learner.normalize_observations",
+    "norm_reward": "learner.normalize_rewards",
+    "save_freq": "checkpoint.every_rounds",
+}
+
 
 def schema() -> Iterator[tuple[str, str, str, str]]:
     """(key, type, default, explanation) of every field, in order."""
@@ -41,7 +62,7 @@ def _type_name(field: Any) -> str:
               for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
               if hasattr(item, attribute)]  # fmt: skip
     if name.startswith("tuple"):
-        name = f"list of {re.findall(r'int|float|str', name)[0]}"
+        name = f"list of {re.findall(r'int|float|str|Literal[^]]*]', name)[0]}"
     return " ".join([name, *limits])
 
 
@@ -62,6 +83,8 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     context = fault.get("ctx", {})
     if kind == "extra_forbidden":
         allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
+        if root is RunConfig and (meant := _SB3_NAMES.get(path[-1])) is not None:
+            return f"{where}: {key}: unknown key. What Stable-Baselines3 calls {path[-1]} is {meant} here"
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {key}: this key is required"

@@ -34,6 +34,8 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
 def read(path: Path) -> dict[str, Any]:
     """A run's config as plain data, not checked yet; relative instance paths become absolute, from its folder."""
     data = read_yaml(path)
+    if "extends" in data and "env" not in data:
+        raise ConfigError(f"{path} is a grid, of many runs: space-dist grid run {path}")
     instances = data.get("instances")
     if isinstance(instances, dict):
         data["instances"] = from_folder(instances, path.absolute().parent)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from space_dist.config.curriculum import CurriculumConfig
 from space_dist.config.learner import LearnerConfig, PPOConfig
@@ -45,12 +45,25 @@ class RunConfig(Section):
     instances: InstancesConfig
     curriculum: CurriculumConfig
     learner: LearnerConfig
-    rollout: RolloutConfig = RolloutConfig()
+    rollout: RolloutConfig = Field(default=RolloutConfig(), validate_default=True)  # behind learner, which it must fit
     budget: BudgetConfig
     evaluation: EvaluationConfig = EvaluationConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     tracking: TrackingConfig = TrackingConfig()
     resources: ResourcesConfig = ResourcesConfig()
+
+    @field_validator("rollout", mode="before")
+    @classmethod
+    def _all_auto(cls, value: Any) -> Any:
+        return {} if value == "auto" else value
+
+    @field_validator("rollout")
+    @classmethod
+    def _fitting(cls, rollout: RolloutConfig, info: ValidationInfo) -> RolloutConfig:
+        learner: LearnerConfig | None = info.data.get("learner")  # None: it has faults of its own
+        if learner is None:
+            return rollout
+        return rollout.fitted(learner.n_steps if learner.episodes_per_round is None else None)
 
     @model_validator(mode="after")
     def _overlap_is_possible(self) -> Self:
@@ -118,14 +131,25 @@ class RunConfig(Section):
         if self.learner.n_steps % per_step:
             raise ValueError(
                 f"learner.n_steps = {self.learner.n_steps} is not a multiple of rollout.shards * rollout.slots = "
-                f"{self.rollout.shards} * {self.rollout.slots} = {per_step}"
+                f"{self.rollout.shards} * {self.rollout.slots} = {per_step}. {self._ways_out(per_step)}"
             )
         if self.budget.steps < self.learner.n_steps:
             raise ValueError(
                 f"budget.steps = {self.budget.steps} is less than one update of learner.n_steps = "
-                f"{self.learner.n_steps}"
+                f"{self.learner.n_steps}. Use budget.steps: {self.learner.n_steps} or more"
             )
         return self
+
+    def _ways_out(self, per_step: int) -> str:
+        """Numbers that would do instead of what a user gave."""
+        n_steps = self.learner.n_steps
+        fitting = RolloutConfig().fitted(n_steps)
+        multiples = [f"{multiple}" for multiple in (n_steps // per_step * per_step, -(-n_steps // per_step) * per_step)
+                     if multiple]  # fmt: skip
+        return (
+            f"Use rollout: auto ({fitting.shards} and {fitting.slots} here), or learner.n_steps: "
+            f"{' or '.join(multiples)}"
+        )
 
     @property
     def n_policies(self) -> int:

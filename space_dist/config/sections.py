@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from space_dist.config.tracking_uri import AUTO, checked_uri
 from space_dist.system.importing import why_refused
@@ -13,6 +13,7 @@ from space_dist.system.importing import why_refused
 MAX_LIST = 10_000  # values of a list in a config
 Sink = Literal["tensorboard", "wandb"]
 SINKS: tuple[Sink, ...] = get_args(Sink)
+_MAX_WORKERS = 4096
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
@@ -67,14 +68,21 @@ class InstancesConfig(Section):
     """CSV of the held-out instances: never trained on, and refused if it shares a context with `train`."""
 
 
-class RolloutConfig(Section):
-    """How transitions are collected. All of it decides results; how many workers share the shards does not."""
+_USUAL = 4  # shards and slots
 
-    shards: int = Field(default=4, ge=1, le=4096)
-    """Independent parts of a round; at most this many workers can share it."""
-    slots: int = Field(default=4, ge=1, le=65536)
+
+class RolloutConfig(Section):
+    """How transitions are collected; auto: by numbers that fit. All of it decides results; how many workers share the
+    shards does not.
+    """
+
+    shards: int = Field(default=_USUAL, ge=1, le=4096)
+    """Independent parts of a round; at most this many workers can share it. Left out, or auto: 4, or the most below
+    with which shards * slots divides learner.n_steps."""
+    slots: int = Field(default=_USUAL, ge=1, le=65536)
     """Environments stepped together in a shard. shards * slots must divide learner.n_steps; episodes go on from round
-    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon."""
+    to round, so n_steps / (shards * slots), the steps of a slot in a round, may be less than the horizon. Left out, or
+    auto: as for shards."""
     passes: float = Field(default=1.0, gt=0.0)
     """Length of an iteration: as many updates as cover this many passes over the selected instances at full horizon."""
     start_states: int = Field(default=1, ge=1, le=1000)
@@ -84,6 +92,27 @@ class RolloutConfig(Section):
     """Collect a round while the update on the one before it runs, with the weights from before that update: for slow
     environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO and A2C
     without normalisation. Source: ours."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _left_out(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        return {key: value for key, value in data.items() if key not in ("shards", "slots") or value != "auto"}
+
+    def fitted(self, n_steps: int | None) -> Self:
+        """The same, with numbers that fit for what was left out. n_steps: of an update; None: it ends by episodes."""
+        given = self.model_fields_set
+        shards = self.shards if "shards" in given else _fitting(n_steps, self.slots if "slots" in given else 1)
+        slots = self.slots if "slots" in given else _fitting(n_steps, shards)
+        return self.model_copy(update={"shards": shards, "slots": slots})
+
+
+def _fitting(n_steps: int | None, other: int) -> int:
+    """The usual number, or the most below it whose product with `other` divides `n_steps`; 1 where none does."""
+    if n_steps is None:
+        return 1
+    return next((number for number in range(_USUAL, 1, -1) if n_steps % (number * other) == 0), 1)
 
 
 class BudgetConfig(Section):
@@ -175,9 +204,18 @@ class Patience(Section):
 class ResourcesConfig(Patience):
     """What the run may use. Decides no result."""
 
-    workers: int = Field(default=1, ge=0, le=4096)
-    """Ray rollout actors; 0: everything in this process, without Ray."""
+    workers: int | Literal["auto"] = Field(default="auto")
+    """Ray rollout actors; 0: everything in this process, without Ray. auto: 0 where the environment steps all slots at
+    once, compiled or in NumPy, so that actors gain nothing; else one for each CPU but one, and for each shard, at
+    most."""
     address: str = Field(default="local", min_length=1, max_length=300)
     """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)
     """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
+
+    @field_validator("workers")
+    @classmethod
+    def _so_many(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and not 0 <= value <= _MAX_WORKERS:
+            raise ValueError(f"must be from 0 to {_MAX_WORKERS}, or auto")
+        return value

@@ -10,8 +10,9 @@ from typing import Any
 
 from gymnasium import spaces
 
-from space_dist.envs import BatchedEnv, close, make_batched, unwrapped
+from space_dist.envs import BULLET_IDS, BatchedEnv, close, make_batched, unwrapped
 from space_dist.envs.interface import Compilable, FloatArray, knows_success, starts_alike
+from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
 
@@ -25,6 +26,7 @@ class EnvironmentSpec:
     observation_space, action_space: of one slot.
     context_bounds: names and bounds of a context's features.
     compiled: whether steps are computed by compiled code, where the environment has such: the same bits, sooner.
+    one_by_one: whether slots are stepped one after another, in Python or in a simulator, so that sharing them pays.
 
     What takes an episode to know is a method, so that nobody pays for it who does not ask.
     """
@@ -37,6 +39,7 @@ class EnvironmentSpec:
     action_space: spaces.Space[Any]
     context_bounds: ContextBounds
     compiled: bool = False
+    one_by_one: bool = False
 
     def make(self, n_slots: int) -> BatchedEnv:
         """A new environment, to be closed (`close`) by whoever asks for it."""
@@ -91,6 +94,7 @@ def read_spec(
         return EnvironmentSpec(
             env_id, context_visible, dict(kwargs), env.horizon,
             _of_gymnasium(env.observation_space), _of_gymnasium(env.action_space), env.context_bounds,
+            one_by_one=env_id in BULLET_IDS or isinstance(unwrapped(env), BatchedSingles),
         )  # fmt: skip
     finally:
         close(env)

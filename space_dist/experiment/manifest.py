@@ -197,7 +197,10 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
 
     Relative paths in the grid file are relative to it. Raises ConfigError with file and key of every fault.
     """
-    grid = configs.check(GridConfig, configs.read_yaml(path), str(path))
+    data = configs.read_yaml(path)
+    if "env" in data and "extends" not in data:
+        raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
+    grid = configs.check(GridConfig, data, str(path))
     folder = path.absolute().parent
     bases = {base: configs.read(folder / base) for base in grid.extends}
     n_runs = len(grid.seed_list())

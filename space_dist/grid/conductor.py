@@ -113,9 +113,10 @@ class Executor(Protocol):
 
 @dataclass
 class Overview:
-    """What a display shows."""
+    """What a display shows. steps_left: of the budgets of all runs that are neither done nor given up."""
 
     total: int
+    steps_left: int
     done: int = 0
     failed: int = 0
     waiting: int = 0
@@ -140,7 +141,7 @@ class Conductor:
         self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
-        self._overview = Overview(len(runs))
+        self._overview = Overview(len(runs), sum(run.cell.budget_steps for run in runs))
 
     def conduct(self) -> list[RunStatus]:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
@@ -186,13 +187,14 @@ class Conductor:
             waiting.append((time.monotonic() + delay, run))
         elif run_status.condition == "failed":
             self._overview.failed += 1
+            self._overview.steps_left -= run.cell.budget_steps
             log.warning("%s: %s: %s", run.title, run_status.in_words, run_status.detail)
         elif not run_status.end_recorded and run_status.supervised:
             self._elsewhere[run.key] = run
         else:
             if not run_status.end_recorded:  # its supervisor died in between
                 concluded(run_status.ledger, run_status.attempts)
-            self._overview.done += 1
+            self._note_done(run)
 
     def _end_if_abandoned(self, run: Run) -> None:
         """A run whose supervisor was killed hears of it and ends, unless it is stopped (SIGSTOP) or hangs."""
@@ -252,7 +254,7 @@ class Conductor:
             self._elsewhere[run.key] = run
             return
         if ended.cause is None:
-            self._overview.done += 1
+            self._note_done(run)
             log.info("%s: done", run.title)
             return
         history = Attempts(self._grid.ledger(run)).history()
@@ -261,6 +263,10 @@ class Conductor:
         self._overview.message = f"{run.title}: {ended.cause.in_words}"
         delay = min(_MAX_DELAY, _FIRST_DELAY * 2 ** max(0, history.ends.get(ended.cause, 0) - 1))
         self._enqueue(run, 0.0 if self._has_got_on(run) else delay)
+
+    def _note_done(self, run: Run) -> None:
+        self._overview.done += 1
+        self._overview.steps_left -= run.cell.budget_steps
 
     def _has_got_on(self, run: Run) -> bool:
         """Whether its last attempt has committed anything: then it is not the run that makes its attempts fail."""

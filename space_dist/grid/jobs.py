@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from space_dist.system.workplace import RAY_DEFAULTS
+from space_dist.system.workplace import RAY_DEFAULTS, cores
 
 os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
@@ -35,7 +35,7 @@ from space_dist.experiment.status import Attempts, RunStatus, settled
 from space_dist.grid.conductor import Conductor, Overview
 from space_dist.grid.pool import Nonce, Pool
 from space_dist.grid.supervisor import AttemptId, ray_answers
-from space_dist.grid.warm import cores, slurms_memory_of_a_core
+from space_dist.grid.warm import slurms_memory_of_a_core
 from space_dist.run.ray_session import attended, join_ray, remove_session
 from space_dist.system.importing import PYTHON
 

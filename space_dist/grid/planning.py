@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from space_dist import config as configs
-from space_dist.config import RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, about
 from space_dist.experiment.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
 from space_dist.grid.conductor import freeze
-from space_dist.instances import ContextBounds, InstanceSet
-from space_dist.run.building import make_setup, memory_of, resolved, spec_of, stack_of, total_steps
-from space_dist.run.launch import read_instances
+from space_dist.instances import InstanceSet
+from space_dist.run.building import Blueprint
 from space_dist.system.provenance import code_digest, git_state, source_digest
 from space_dist.tracking.settling import settled
 
@@ -73,10 +71,11 @@ class _InstanceFiles:
         self._read: dict[tuple[object, ...], tuple[InstanceSet, InstanceSet]] = {}
         self._names: dict[int, str] = {}
 
-    def sets(self, config: RunConfig, bounds: ContextBounds) -> tuple[InstanceSet, InstanceSet]:
-        key = (config.instances.train, config.instances.test, bounds)
+    def sets(self, blueprint: Blueprint) -> tuple[InstanceSet, InstanceSet]:
+        files = blueprint.config.instances
+        key = (files.train, files.test, blueprint.spec.context_bounds)
         if key not in self._read:
-            self._read[key] = read_instances(config, bounds)
+            self._read[key] = blueprint.instances()
         return self._read[key]
 
     def name(self, instances: InstanceSet) -> str:
@@ -98,22 +97,22 @@ def _cell(
     config = configs.parse({**data, "name": name}, where)
     with about(where):
         section = config.env.model_dump_json()
-        spec = specs[section] = specs.get(section) or spec_of(config)
-        config = resolved(config, spec, can_share=grid.resources.workers == 0)
+        blueprint = Blueprint.of(config, specs.get(section), can_share=grid.resources.workers == 0)
+        config, specs[section] = blueprint.config, blueprint.spec
         if config.engine == "population" and grid.resources.workers:
             raise ConfigError(
                 f"engine: population with resources.workers: {grid.resources.workers}: runs that share a process have "
                 "no rollout actors of their own; use workers: 0, or engine: single"
             )
-        train, test = files.sets(config, spec.context_bounds)
-        make_setup(config, spec, train, test)
+        train, test = files.sets(blueprint)
+        blueprint.setup(train, test)
         sources = {path: source_digest(path) for path in config.import_paths}
     identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
     data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
     data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
                              (("train", train), ("test", test))}  # fmt: skip
-    steps = total_steps(config, spec.horizon)
-    return Cell(identity[:CELL_ID_DIGITS], label, point, data, stack_of(config, spec), memory_of(config, spec)), steps
+    cell = Cell(identity[:CELL_ID_DIGITS], label, point, data, blueprint.stack, blueprint.memory)
+    return cell, blueprint.total_steps
 
 
 def _distinct(cells: Any) -> tuple[Cell, ...]:

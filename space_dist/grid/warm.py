@@ -24,6 +24,7 @@ from space_dist.experiment.status import settled
 from space_dist.grid.supervisor import KILL_SECONDS, STOPPED_SECONDS, AttemptId, Task
 from space_dist.system.files import in_words
 from space_dist.system.importing import PYTHON
+from space_dist.system.workplace import cores
 
 log = logging.getLogger("space_dist")
 
@@ -213,12 +214,6 @@ class LocalExecutor:
 def local_is_enough(manifest: Manifest, runs: Sequence[Run], max_parallel: int | None) -> bool:
     """Whether all there is to do here is done one after another, by processes that need no Ray themselves."""
     return not manifest.resources.workers and min(max_parallel or cores(), len(runs)) <= 1
-
-
-def cores() -> int:
-    """CPUs that are ours: SLURM may give us fewer than it lets us see."""
-    found, given = len(os.sched_getaffinity(0)), os.environ.get("SLURM_CPUS_PER_TASK", "")
-    return min(found, int(given)) if given.isdecimal() and int(given) else found
 
 
 def slurms_memory_of_a_core() -> list[float]:

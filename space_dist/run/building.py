@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
 
+from space_dist import arithmetic
 from space_dist.config import RunConfig, learners_that
 from space_dist.curricula import Curriculum
 from space_dist.curricula.making import make_curriculum
 from space_dist.envs.spec import EnvironmentSpec, read_spec
-from space_dist.errors import ConfigError
-from space_dist.instances import InstanceSet
+from space_dist.errors import ConfigError, about, nearest
+from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 from space_dist.learner import (
     CoupledLearner,
     Ensemble,
@@ -21,6 +23,7 @@ from space_dist.learner import (
     make_ensemble,
     make_learner,
     member_bytes,
+    refuse_machine,
     refuse_population,
     refuse_spaces,
     stack_key,
@@ -38,135 +41,201 @@ def spec_of(config: RunConfig) -> EnvironmentSpec:
     return read_spec(config.env.id, context_visible=config.env.context_visible, kwargs=config.env.kwargs)
 
 
-def make_setup(config: RunConfig, spec: EnvironmentSpec, train: InstanceSet, test: InstanceSet) -> Setup:
-    """What workers must know. Raises ConfigError if the config cannot work with its environment or instances."""
-    setup = Setup(
-        spec=dataclasses.replace(spec, compiled=config.learner.is_compiled(config.engine)),
-        seed=config.seed,
-        gamma=config.learner.gamma,
-        shards=config.rollout.shards * config.n_policies,
-        slots=config.rollout.slots,
-        slot_length=config.slot_length(spec.horizon),
-        start_states=config.rollout.start_states,
-        evaluation_episodes=config.evaluation.episodes,
-        train=train,
-        test=test,
-        episodes_per_round=config.n_episodes,
-        keep_next_observations=config.learner.keeps_next_observations,
-        policies=config.n_policies,
-    )
-    scales = config.learner.normalize_observations or config.learner.normalize_rewards
-    needed = config.round_steps(spec.horizon) * (2 if scales else 1)
-    if config.budget.steps < needed:
-        raise ConfigError(
-            f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
-            + (", and the round before it that gives normalisation its first scales" if scales else "")
+@dataclass(frozen=True)
+class Blueprint:
+    """A config, and what its environment is like: what everything that a run is made of is made from."""
+
+    config: RunConfig
+    spec: EnvironmentSpec
+
+    @classmethod
+    def of(cls, config: RunConfig, spec: EnvironmentSpec | None = None, *, can_share: bool = True) -> Blueprint:
+        """The config with `engine: auto` decided: population where the learner allows it.
+
+        spec: of the config's environment, where that is known already. can_share: whether runs share a process.
+        Raises ConfigError if the environment cannot be made.
+        """
+        drawn = cls(config, spec or spec_of(config))
+        return dataclasses.replace(drawn, config=drawn._with_engine(can_share)) if config.engine == "auto" else drawn
+
+    def _with_engine(self, can_share: bool) -> RunConfig:
+        config, spec = self.config, self.spec
+        stock = not config.learner.is_compiled("single")
+        engine = "population" if can_share and stock and not config.rollout.overlap else "single"
+        try:
+            refuse_population(config.learner, spec.observation_space, spec.action_space)
+        except ConfigError:
+            engine = "single"
+        return config.model_copy(update={"engine": engine})
+
+    def instances(self) -> tuple[InstanceSet, InstanceSet]:
+        """The training and test instances, from their files.
+
+        Raises ConfigError for a bad file, a context outside the environment's bounds, or one that both share.
+        """
+        files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.curriculum.columns_read
+        with about("instances.train"):
+            train = read_csv(files.train, bounds, columns)
+        with about("instances.test"):
+            test = read_csv(files.test, bounds, columns, if_there=True)
+        refuse_overlap(train, test, str(files.train), str(files.test))
+        return train, test
+
+    def setup(self, train: InstanceSet, test: InstanceSet) -> Setup:
+        """What workers must know. Raises ConfigError if the config cannot work with its environment or instances."""
+        config, spec = self.config, self.spec
+        setup = Setup(
+            spec=dataclasses.replace(spec, compiled=config.learner.is_compiled(config.engine)),
+            seed=config.seed,
+            gamma=config.learner.gamma,
+            shards=config.rollout.shards * config.n_policies,
+            slots=config.rollout.slots,
+            slot_length=config.slot_length(spec.horizon),
+            start_states=config.rollout.start_states,
+            evaluation_episodes=config.evaluation.episodes,
+            train=train,
+            test=test,
+            episodes_per_round=config.n_episodes,
+            keep_next_observations=config.learner.keeps_next_observations,
+            policies=config.n_policies,
         )
-    refuse_spaces(config.learner, spec.observation_space, spec.action_space)
-    if config.engine == "population":
-        refuse_population(config.learner, spec.observation_space, spec.action_space)
-    if config.curriculum.ranks_by_start_value and spec.starts_alike(train.contexts[:_COMPARED_STARTS]):
-        raise ConfigError(
-            f"curriculum.kind: {config.curriculum.kind} ranks instances by the value of their start, but all instances "
-            "start with the same observation, so all values tie and the order would be a random one. Set "
-            "env.context_visible: true"
-            + (
-                ", or curriculum.allow_context_blind: true to run the released code's setting"
-                if "allow_context_blind" in type(config.curriculum).model_fields
-                else ""
+        self._refuse_short_budget()
+        refuse_spaces(config.learner, spec.observation_space, spec.action_space)
+        if config.engine == "population":
+            refuse_population(config.learner, spec.observation_space, spec.action_space)
+        self._refuse_equal_starts(train)
+        # Asks the curriculum for what is not there? Better refused now than on an actor.
+        self._refuse_wants(self.curriculum(train))
+        self.ensemble()
+        return setup
+
+    def curriculum(self, train: InstanceSet) -> Curriculum:
+        """The curriculum over `train`. Raises ConfigError if it asks for instances or features that are not there."""
+        return make_curriculum(self.config, train, self.spec.context_bounds)
+
+    def learner(self) -> Learner:
+        """The learner, or all of several policies, with initial networks."""
+        config = self.config
+        if config.n_policies == 1:
+            return self._one_learner(config.seed)
+        coupled = [self._one_learner(int(seed)) for seed in member_seeds(config.seed, config.n_policies)]
+        return CoupledLearner([one for each in coupled for one in each.learners])
+
+    def _one_learner(self, seed: int) -> Learner:
+        config, spec = self.config, self.spec
+        return make_learner(
+            config.learner, spec.observation_space, spec.action_space,
+            seed=seed, n_slots=config.rollout.shards * config.rollout.slots,
+            slot_length=config.slot_length(spec.horizon), total_steps=self.total_steps,
+            population=config.engine == "population", device=config.device,
+        )  # fmt: skip
+
+    def ensemble(self) -> Ensemble | None:
+        """The value functions that the curriculum asks for, if it does, with initial networks."""
+        return make_ensemble(self.config, self.spec.observation_space, self.spec.context_bounds.names)
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of a whole run: those of the rounds that fit.
+
+        The budget, where rounds end by episodes or probes come between them.
+        """
+        config, round_steps = self.config, self.config.round_steps(self.spec.horizon)
+        if config.n_episodes is not None or config.curriculum.may_probe:
+            return config.budget.steps
+        return config.budget.steps // round_steps * round_steps
+
+    @property
+    def stack(self) -> str:
+        """`(16 hex digits)` equal for runs that may be members of one population; empty for those of no population."""
+        config = self.config
+        if config.engine != "population":
+            return ""
+        key = (
+            config.env.model_dump_json(),
+            config.device,
+            stack_key(config.learner, self.spec.observation_space, self.spec.action_space),
+        )
+        return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+
+    @property
+    def memory(self) -> int:
+        """About what a run takes of the memory of the process that it shares, in MB; 0 for one that works alone."""
+        config, spec = self.config, self.spec
+        if config.engine != "population" or not config.learner.can_be_stacked:
+            return 0
+        each = member_bytes(config.learner, spec.observation_space, spec.action_space, config.device)
+        return -(-config.n_policies * each >> 20)
+
+    def policy_in(self, checkpoint: Checkpoint) -> Policy | Several:
+        """The policy, or policies, that a checkpoint holds."""
+        learner = self.learner()
+        load_learner(learner, checkpoint)
+        return learner.policy(checkpoint.round)
+
+    # ---- what cannot be ----
+
+    def refuse_machine(self) -> None:
+        """Raise ConfigError where this machine, or this process, cannot compute the run as its config says."""
+        refuse_machine(self.config)
+        _refuse_other_arithmetic(self.config)
+
+    def _refuse_short_budget(self) -> None:
+        config = self.config
+        scales = config.learner.normalize_observations or config.learner.normalize_rewards
+        needed = config.round_steps(self.spec.horizon) * (2 if scales else 1)
+        if config.budget.steps < needed:
+            raise ConfigError(
+                f"budget.steps = {config.budget.steps} is less than the {needed} steps that one update may take"
+                + (", and the round before it that gives normalisation its first scales" if scales else "")
             )
-        )
-    # Asks the curriculum for what is not there? Better refused now than on an actor.
-    _refuse_wants(config, spec, make_curriculum(config, train, spec.context_bounds))
-    ensemble_of(config, spec)
-    return setup
+
+    def _refuse_equal_starts(self, train: InstanceSet) -> None:
+        settings = self.config.curriculum
+        if settings.ranks_by_start_value and self.spec.starts_alike(train.contexts[:_COMPARED_STARTS]):
+            raise ConfigError(
+                f"curriculum.kind: {settings.kind} ranks instances by the value of their start, but all instances "
+                "start with the same observation, so all values tie and the order would be a random one. Set "
+                "env.context_visible: true"
+                + (
+                    ", or curriculum.allow_context_blind: true to run the released code's setting"
+                    if "allow_context_blind" in type(settings).model_fields
+                    else ""
+                )
+            )
+
+    def _refuse_wants(self, curriculum: Curriculum) -> None:
+        """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
+        config, kind = self.config, self.config.curriculum.kind
+        if curriculum.wants.advantages and not config.learner.has_advantages:
+            raise ConfigError(
+                f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: "
+                f"{config.learner.kind} does not compute. Allowed learners: "
+                f"{', '.join(learners_that('has_advantages'))}"
+            )
+        if curriculum.wants.probes and not self.spec.knows_success(curriculum.start()[1].contexts[:1]):
+            raise ConfigError(
+                f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} "
+                "does not say (its steps have no `success`)"
+            )
 
 
-def _refuse_wants(config: RunConfig, spec: EnvironmentSpec, curriculum: Curriculum) -> None:
-    """Raise ConfigError if learner or environment cannot give a curriculum the feedback it asks for."""
-    kind = config.curriculum.kind
-    if curriculum.wants.advantages and not config.learner.has_advantages:
+def _refuse_other_arithmetic(config: RunConfig) -> None:
+    """Raise ConfigError where this process, which chose before it knew the config, computes with another arithmetic."""
+    here, known = arithmetic.chosen(), ("one", "native")
+    if here not in known:
+        raise ConfigError(f"{arithmetic.CHOICE}={here} of the environment is not known{nearest(here, known)} "
+                          "Allowed: one, native")  # fmt: skip
+    if config.arithmetic == "native" and here != "native":
         raise ConfigError(
-            f"curriculum.kind: {kind} scores episodes by their advantages, which learner.kind: {config.learner.kind} "
-            f"does not compute. Allowed learners: {', '.join(learners_that('has_advantages'))}"
+            f"arithmetic: native is chosen before libraries are loaded: start with {arithmetic.CHOICE}=native in the "
+            "environment (of a grid: of all its nodes), or use arithmetic: one"
         )
-    if curriculum.wants.probes and not spec.knows_success(curriculum.start()[1].contexts[:1]):
+    if config.arithmetic != here:
         raise ConfigError(
-            f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} does "
-            "not say (its steps have no `success`)"
+            f"{arithmetic.CHOICE}=native of the environment, and arithmetic: one in the config: unset it, or use "
+            "--set arithmetic=native"
         )
-
-
-def total_steps(config: RunConfig, horizon: int) -> int:
-    """Environment steps of a whole run: those of the rounds that fit.
-
-    The budget, where rounds end by episodes or probes come between them.
-    """
-    if config.n_episodes is not None or config.curriculum.may_probe:
-        return config.budget.steps
-    return config.budget.steps // config.round_steps(horizon) * config.round_steps(horizon)
-
-
-def resolved(config: RunConfig, spec: EnvironmentSpec, *, can_share: bool = True) -> RunConfig:
-    """The config with `engine: auto` decided: population where the learner allows it and runs `can_share` a process."""
-    if config.engine != "auto":
-        return config
-    stock = not config.learner.is_compiled("single")
-    engine = "population" if can_share and stock and not config.rollout.overlap else "single"
-    try:
-        refuse_population(config.learner, spec.observation_space, spec.action_space)
-    except ConfigError:
-        engine = "single"
-    return config.model_copy(update={"engine": engine})
-
-
-def stack_of(config: RunConfig, spec: EnvironmentSpec) -> str:
-    """`(16 hex digits)` equal for runs that may be members of one population; empty for those of no population."""
-    if config.engine != "population":
-        return ""
-    key = (
-        config.env.model_dump_json(),
-        config.device,
-        stack_key(config.learner, spec.observation_space, spec.action_space),
-    )
-    return hashlib.sha256(repr(key).encode()).hexdigest()[:16]
-
-
-def memory_of(config: RunConfig, spec: EnvironmentSpec) -> int:
-    """About what a run takes of the memory of the process that it shares, in MB; 0 for a run that works alone."""
-    if config.engine != "population" or not config.learner.can_be_stacked:
-        return 0
-    each = member_bytes(config.learner, spec.observation_space, spec.action_space, config.device)
-    return -(-config.n_policies * each >> 20)
-
-
-def learner_of(config: RunConfig, spec: EnvironmentSpec) -> Learner:
-    """A config's learner with its initial networks."""
-    if config.n_policies == 1:
-        return _learner_of(config, spec, config.seed)
-    coupled = [_learner_of(config, spec, int(seed)) for seed in member_seeds(config.seed, config.n_policies)]
-    return CoupledLearner([one for each in coupled for one in each.learners])
-
-
-def _learner_of(config: RunConfig, spec: EnvironmentSpec, seed: int) -> Learner:
-    return make_learner(
-        config.learner, spec.observation_space, spec.action_space,
-        seed=seed, n_slots=config.rollout.shards * config.rollout.slots,
-        slot_length=config.slot_length(spec.horizon), total_steps=total_steps(config, spec.horizon),
-        population=config.engine == "population", device=config.device,
-    )  # fmt: skip
-
-
-def ensemble_of(config: RunConfig, spec: EnvironmentSpec) -> Ensemble | None:
-    """The ensemble of value functions that a config's curriculum asks for, if it does, with its initial networks."""
-    return make_ensemble(config, spec.observation_space, spec.context_bounds.names)
-
-
-def policy_in(checkpoint: Checkpoint, config: RunConfig, spec: EnvironmentSpec) -> Policy | Several:
-    """The policy, or policies, that a checkpoint holds."""
-    learner = learner_of(config, spec)
-    load_learner(learner, checkpoint)
-    return learner.policy(checkpoint.round)
 
 
 def model_of(learner: Learner, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

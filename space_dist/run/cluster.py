@@ -14,10 +14,12 @@ import numpy as np
 
 from space_dist.config import CurriculumConfig, RunConfig
 from space_dist.curricula import Curriculum, Episodes, Feedback, Probes, Selection, State
+from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Worker, joined
 from space_dist.rollout.walk import Walk
+from space_dist.system.workplace import cores
 
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
@@ -92,6 +94,16 @@ class Cluster(Protocol):
 
     def get(self, handles: Sequence[Handle]) -> list[Any]:
         """Wait for values."""
+
+
+def n_workers(config: RunConfig, spec: EnvironmentSpec) -> int:
+    """Rollout actors of a run; 0: everything in its own process. Decides no result."""
+    resources = config.resources
+    if isinstance(resources.workers, int):
+        return resources.workers
+    if resources.address == "local" and not spec.one_by_one:
+        return 0
+    return max(1, min(config.rollout.shards, cores() - 1))
 
 
 class CurriculumHost:

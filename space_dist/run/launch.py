@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from space_dist import arithmetic
 from space_dist import config as configs
-from space_dist.config import RunConfig
+from space_dist.config import RunConfig, TrackingConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import (
@@ -33,17 +33,14 @@ from space_dist.errors import (
     LedgerError,
     RunLockedError,
     SpaceDistError,
-    about,
     exits_refused,
-    nearest,
 )
-from space_dist.instances import ContextBounds, InstanceSet, read_csv, refuse_overlap
-from space_dist.learner import refuse_machine, torch_checks
+from space_dist.learner import torch_checks
 from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
-from space_dist.run.building import make_setup, policy_in, resolved, spec_of
-from space_dist.run.cluster import Cluster, InProcess
+from space_dist.run.building import Blueprint
+from space_dist.run.cluster import Cluster, InProcess, n_workers
 from space_dist.run.training import Progress, Training
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
@@ -66,20 +63,6 @@ class Outcome:
     tracking_warning: str | None = None
 
 
-def read_instances(config: RunConfig, bounds: ContextBounds) -> tuple[InstanceSet, InstanceSet]:
-    """The training and test instances of a config, whose contexts lie in `bounds`.
-
-    Raises ConfigError for a bad file, or one that shares a context.
-    """
-    columns = config.curriculum.columns_read
-    with about("instances.train"):
-        train = read_csv(config.instances.train, bounds, columns)
-    with about("instances.test"):
-        test = read_csv(config.instances.test, bounds, columns, if_there=True)
-    refuse_overlap(train, test, str(config.instances.train), str(config.instances.test))
-    return train, test
-
-
 def launch(
     config: RunConfig,
     folder: Path,
@@ -87,8 +70,11 @@ def launch(
     resume: bool,
     stop: StopRequests,
     observe: Callable[[Progress], None] = lambda progress: None,
+    waiting: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
     """Run `config` in `folder` to its end, or go on where it stopped.
+
+    observe: told of progress. waiting: told what is waited for, before and behind that: `starting Ray`.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
@@ -96,8 +82,11 @@ def launch(
     """
     with begun(config, folder, resume=resume, stop=stop) as active:
         if not active.outcome.already_done:
-            with _cluster(active) as cluster:
+            with _cluster(active, waiting) as cluster:
+                waiting("preparing the learner")
                 active.training(cluster, observe).run()
+    if active.pusher is not None:
+        waiting(f"mirroring to MLflow, for {_FINAL_PUSH_SECONDS:.0f} s at most")
     return active.finished()
 
 
@@ -105,7 +94,7 @@ def launch(
 class ActiveRun:
     """A run that is this process's own now. outcome: how it ends; `already_done` where there is nothing to do."""
 
-    config: RunConfig
+    blueprint: Blueprint
     setup: Setup
     writer: RunWriter
     status: Status
@@ -117,7 +106,7 @@ class ActiveRun:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
         self.raise_if_stopped()
         return Training(
-            self.config, self.setup, cluster, self.writer,
+            self.blueprint, self.setup, cluster, self.writer,
             status=self.status, stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
 
@@ -150,22 +139,20 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 @contextlib.contextmanager
 def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
-    ledger, spec = Ledger(folder), spec_of(config)
-    config = resolved(config, spec).model_copy(update={"tracking": settled(config.tracking, "space_dist")})
-    train, test = read_instances(config, spec.context_bounds)
-    setup = make_setup(config, spec, train, test)
-    refuse_machine(config)
-    _refuse_other_arithmetic(config)
+    config = config.model_copy(update={"tracking": settled(config.tracking, "space_dist")})
+    ledger, blueprint = Ledger(folder), Blueprint.of(config)
+    setup = blueprint.setup(*blueprint.instances())
+    blueprint.refuse_machine()
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
-        status = _claim(config, setup, writer)
-        active = ActiveRun(config, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
+        status = _claim(blueprint, setup, writer)
+        active = ActiveRun(blueprint, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
         if active.outcome.already_done:
             yield active
             return
-        stop.watch(ledger.stop_file, config.resources.grace_seconds)
-        active.pusher = _start_pusher(config, ledger)
+        stop.watch(ledger.stop_file, blueprint.config.resources.grace_seconds)
+        active.pusher = _start_pusher(blueprint.config.tracking, ledger)
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
@@ -175,27 +162,9 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
                 )
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
                 log.warning("%s", remark)
-            log.info("seed %d, budget of %d environment steps", config.seed, config.budget.steps)
+            log.info("seed %d, budget of %d environment steps", status.seed, status.budget_steps)
             active.raise_if_stopped()  # before Ray is started
             yield active
-
-
-def _refuse_other_arithmetic(config: RunConfig) -> None:
-    """Raise ConfigError where this process, which chose before it knew the config, computes with another arithmetic."""
-    here, known = arithmetic.chosen(), ("one", "native")
-    if here not in known:
-        raise ConfigError(f"{arithmetic.CHOICE}={here} of the environment is not known{nearest(here, known)} "
-                          "Allowed: one, native")  # fmt: skip
-    if config.arithmetic == "native" and here != "native":
-        raise ConfigError(
-            f"arithmetic: native is chosen before libraries are loaded: start with {arithmetic.CHOICE}=native in the "
-            "environment (of a grid: of all its nodes), or use arithmetic: one"
-        )
-    if config.arithmetic != here:
-        raise ConfigError(
-            f"{arithmetic.CHOICE}=native of the environment, and arithmetic: one in the config: unset it, or use "
-            "--set arithmetic=native"
-        )
 
 
 def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
@@ -207,9 +176,9 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
         raise Interrupted(message)
 
 
-def _claim(config: RunConfig, setup: Setup, writer: RunWriter) -> Status:
+def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
-    ledger = writer.ledger
+    config, ledger = blueprint.config, writer.ledger
     now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config), config.import_paths)
     status = Status(
         state="running", name=config.name, seed=config.seed, steps=0, budget_steps=config.budget.steps, round=0,
@@ -299,7 +268,7 @@ def _refuse_other_run(
         return
     try:  # the stored config decides as this version reads it, if it is known to be what the run wrote
         stored = configs.load(ledger.config) if before is None else stored_config(ledger)
-        train, test = read_instances(stored, spec_of(stored).context_bounds)
+        train, test = Blueprint.of(stored).instances()
     except LedgerError as error:
         raise ConfigError(
             f"{ledger.folder} holds a run of another configuration; which cannot be told: {error}"
@@ -349,22 +318,28 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
     checkpoint = ledger.last_checkpoint()
     if checkpoint is None:
         raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
-    return policy_in(checkpoint, stored_config(ledger), spec)
+    return Blueprint(stored_config(ledger), spec).policy_in(checkpoint)
 
 
 @contextlib.contextmanager
-def _cluster(active: ActiveRun) -> Iterator[Cluster]:
-    if active.config.resources.workers == 0:
-        with contextlib.closing(InProcess(active.config, active.setup)) as here:
+def _cluster(active: ActiveRun, waiting: Callable[[str], None]) -> Iterator[Cluster]:
+    config = active.blueprint.config
+    workers = n_workers(config, active.blueprint.spec)
+    if workers == 0:
+        with contextlib.closing(InProcess(config, active.setup)) as here:
             yield here
         return
-    if active.config.resources.address == "local":
+    actors = f"{workers} rollout actor{'s' if workers > 1 else ''}"
+    if config.resources.address == "local":
+        waiting(f"starting Ray with {actors}")
         private_ray()
+    else:
+        waiting(f"waiting for room for {actors} on the Ray at {config.resources.address}")
     from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
 
     with contextlib.ExitStack() as stack:
         with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(active.config, active.setup, active.raise_if_stopped, active.note))
+            cluster = stack.enter_context(RayCluster(config, active.setup, active.raise_if_stopped, active.note))
         yield cluster
 
 
@@ -471,11 +446,11 @@ def _logging_to(path: Path) -> Iterator[None]:
         handler.close()
 
 
-def _start_pusher(config: RunConfig, ledger: Ledger) -> Pusher | None:
-    if not (config.tracking.anywhere and config.tracking.live):
+def _start_pusher(tracking: TrackingConfig, ledger: Ledger) -> Pusher | None:
+    if not (tracking.anywhere and tracking.live):
         return None
     try:
-        return Pusher(config.tracking, ledger.folder, ledger.folder / "tracking.log")
+        return Pusher(tracking, ledger.folder, ledger.folder / "tracking.log")
     except OSError as error:
         log.warning("nothing is mirrored while the run trains: %s. `space-dist sync` can do it later", in_words(error))
         return None

@@ -35,7 +35,7 @@ from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.rollout import FloatArray, IntArray, Setup, Split
 from space_dist.rollout.walk import Walk
-from space_dist.run.cluster import Decision, Evidence, Handle
+from space_dist.run.cluster import Decision, Evidence, Handle, n_workers
 from space_dist.run.ray_actors import (
     CENTRAL,
     CurriculumActor,
@@ -107,6 +107,7 @@ class RayCluster:
     ) -> None:
         """As `join_ray` for `raise_if_stopped` and `note`."""
         self._config, self._resources, self._setup = config, config.resources, setup
+        self._workers = max(1, n_workers(config, setup.spec))
         self._raise_if_stopped, self._note = raise_if_stopped, note
         self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
@@ -122,14 +123,14 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, resources.workers + 1, self._raise_if_stopped, self._note)
+        found = join_ray(resources.address, self._workers + 1, self._raise_if_stopped, self._note)
         self._session = found["session_dir"] if resources.address == "local" else None
         self._watch.enter_context(attended(found, resources.address, gone=True, leave=shut_down, note=self._note))
         try:
             self._remote_setup = self.put(self._setup)
-            if not self._take_room(resources.workers, resources.room_seconds):
-                raise self._no_room(resources.workers)
-            self._start((*range(resources.workers), CENTRAL))
+            if not self._take_room(self._workers, resources.room_seconds):
+                raise self._no_room(self._workers)
+            self._start((*range(self._workers), CENTRAL))
             while self._starting:
                 self._look_after_starting()
         except BaseException:
@@ -420,12 +421,12 @@ class RayCluster:
                         ray.kill(actor)
                 self._actors, self._starting = {}, {}
                 self._leave_room()
-                workers = max(1, min(self._resources.workers, int(cpus()[1])))
+                workers = max(1, min(self._workers, int(cpus()[1])))
                 if not self._take_room(workers, _RESCHEDULING_SECONDS):
                     if waited > seconds:
                         raise self._no_room(workers)
                     continue
-                log.warning("room is left for %d of %d rollout actors", workers, self._resources.workers)
+                log.warning("room is left for %d of %d rollout actors", workers, self._workers)
                 self._start((*range(workers), CENTRAL))
 
     def _has_room(self) -> bool:

@@ -32,9 +32,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from space_dist.config import RunConfig
 from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
-from space_dist.curricula.making import make_curriculum
 from space_dist.errors import Interrupted
 from space_dist.learner import Arrays, Learner, Update
 from space_dist.ledger import (
@@ -54,7 +52,7 @@ from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
 from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, summed
 from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
-from space_dist.run.building import ensemble_of, learner_of, load_learner, model_of, total_steps
+from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
 from space_dist.run.state import RunState
 
@@ -123,7 +121,7 @@ class Training:
 
     def __init__(
         self,
-        config: RunConfig,
+        blueprint: Blueprint,
         setup: Setup,
         cluster: Cluster,
         writer: RunWriter,
@@ -132,13 +130,13 @@ class Training:
         stop_requested: Callable[[], str | None] = lambda: None,
         observe: Callable[[Progress], None] = lambda progress: None,
     ) -> None:
-        self._config, self._setup, self._cluster, self._writer = config, setup, cluster, writer
+        self._config, self._setup, self._cluster, self._writer = blueprint.config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
-        spec, self._horizon = setup.spec, setup.spec.horizon
-        self._total_steps = total_steps(config, self._horizon)
-        self.learner = learner_of(config, spec)
-        self.ensemble = ensemble_of(config, spec)
-        self._curriculum = make_curriculum(config, setup.train, spec.context_bounds)
+        self._horizon = setup.spec.horizon
+        self._total_steps = blueprint.total_steps
+        self.learner = blueprint.learner()
+        self.ensemble = blueprint.ensemble()
+        self._curriculum = blueprint.curriculum(setup.train)
         self._run, self._asked = RunState(), _InFlight()
         self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()

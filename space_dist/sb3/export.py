@@ -16,7 +16,7 @@ from space_dist.learner import SB3Learner
 from space_dist.learner.networks import ALGORITHMS
 from space_dist.ledger import Checkpoint, Ledger
 from space_dist.rollout.policy import OBSERVATION_CLIP
-from space_dist.run.building import learner_of, spec_of
+from space_dist.run.building import Blueprint, spec_of
 from space_dist.run.launch import stored_config
 from space_dist.sb3 import ContextVecEnv
 
@@ -69,7 +69,7 @@ def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpo
         changes["learner"] = config.learner.model_copy(update={"update": "stock"})
     if isinstance(config.curriculum, GrowingConfig):
         changes["curriculum"] = config.curriculum.model_copy(update={"aggregate": "own"})
-    learner = learner_of(config.model_copy(update=changes), spec)
+    learner = Blueprint(config.model_copy(update=changes), spec).learner()
     if not isinstance(learner, SB3Learner):
         raise TypeError(f"one policy has one learner, not {type(learner).__name__}")
     several = config.n_policies > 1

@@ -53,6 +53,12 @@ def lasting(path: Path, option: str) -> Path:
     return path.absolute()
 
 
+def cores() -> int:
+    """CPUs that are ours: SLURM may give us fewer than it lets us see."""
+    found, given = len(os.sched_getaffinity(0)), os.environ.get("SLURM_CPUS_PER_TASK", "")
+    return min(found, int(given)) if given.isdecimal() and int(given) else found
+
+
 def private_ray() -> None:
     """Prepare this process for Rays of its own; to be called before Ray is imported, which reads these once.
 

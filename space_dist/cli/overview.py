@@ -1,0 +1,205 @@
+"""How a grid stands, for people: the table of what runs now, its cells, what failed, and one line of all that."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from space_dist.cli.terminal import console, say
+from space_dist.errors import SpaceDistError
+
+if TYPE_CHECKING:
+    from space_dist.experiment.manifest import Cell, Grid, Manifest
+    from space_dist.experiment.status import RunStatus
+    from space_dist.grid.conductor import Overview
+    from space_dist.slurm.queue import Queue
+
+_LOG_SECONDS = 30.0
+_SHOWN_RUNS = 12
+_ANY_WIDTH = 10_000  # characters
+_COUNT_SECONDS = 5.0  # between two looks at how far all running runs are
+
+
+@contextlib.contextmanager
+def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], None]]:
+    """On a terminal a table of what runs now; elsewhere a line now and then."""
+    time_left = _TimeLeft(place)
+    if console.is_terminal:
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            yield lambda overview: live.update(_live_table(manifest, place, overview, time_left.in_words(overview)))
+        return
+    logged_at = 0.0
+    logged: tuple[object, ...] = ()
+
+    def observe(overview: Overview) -> None:
+        nonlocal logged_at, logged
+        line = (
+            f"{manifest.name}: {overview.done} of {overview.total} done, {len(overview.running)} running, "
+            f"{overview.waiting} waiting, {overview.failed} failed{time_left.in_words(overview)}"
+        )
+        if overview.message:
+            line += f" (last: {overview.message})"
+        news = (overview.done, overview.failed, overview.message)
+        if time.monotonic() - logged_at > _LOG_SECONDS or news != logged:
+            logged_at, logged = time.monotonic(), news
+            say(line)
+
+    yield observe
+
+
+class _TimeLeft:
+    """How long a grid still takes, at the rate of what was seen of it."""
+
+    def __init__(self, place: Grid) -> None:
+        self._place = place
+        self._first: tuple[float, int] | None = None  # when we looked first, and the steps that were left then
+        self._looked, self._words = 0.0, ""
+
+    def in_words(self, overview: Overview) -> str:
+        """`, about 0:12:00 left`; nothing as long as that cannot be told."""
+        now = time.monotonic()
+        if now - self._looked >= _COUNT_SECONDS or not overview.steps_left:
+            self._looked, self._words = now, self._estimated(overview, now)
+        return self._words
+
+    def _estimated(self, overview: Overview, now: float) -> str:
+        taken = 0
+        for run in overview.running:
+            with contextlib.suppress(SpaceDistError):
+                taken += self._place.ledger(run).status().steps
+        left = max(0, overview.steps_left - taken)
+        if self._first is None:
+            self._first = now, left
+        seconds, done = now - self._first[0], self._first[1] - left
+        if not left or done <= 0:
+            return ""
+        return f", about {datetime.timedelta(seconds=round(left * seconds / done))} left"
+
+
+def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: str) -> Table:
+    from space_dist.ledger import CURRICULUM
+
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(overflow="fold")
+    done = overview.done / max(1, overview.total)
+    bar = "█" * round(24 * done) + "░" * (24 - round(24 * done))
+    counts = f"{overview.done} of {overview.total} runs done"
+    counts += f", {overview.failed} failed" if overview.failed else ""
+    table.add_row(Text(manifest.name, style="bold"), Text(f"{bar} {counts}, {overview.waiting} waiting{time_left}"))
+    for run in overview.running[:_SHOWN_RUNS]:
+        ledger, line = place.ledger(run), "starting"
+        with contextlib.suppress(SpaceDistError, KeyError, IndexError):
+            rows = ledger.rows(CURRICULUM)
+            evaluations = [row for row in ledger.rows() if row["kind"] == "evaluation"]
+            shown = f"{evaluations[-1]['test']['return']:.1f}" if evaluations else "—"
+            steps = rows[-1]["steps"] if rows else 0
+            size = len(rows[-1]["trained"]) if rows else 0
+            line = f"{steps:>10,} of {run.cell.budget_steps:,} steps   set {size}   test return {shown}"
+        table.add_row(Text(run.title), Text(line))
+    if len(overview.running) > _SHOWN_RUNS:
+        table.add_row("", Text(f"and {len(overview.running) - _SHOWN_RUNS} more"))
+    if overview.message:
+        table.add_row(Text("last", style="red"), Text(overview.message))
+    return table
+
+
+def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
+    """How the seeds of each cell stand: a line for each, and a label's whole words, whatever the terminal's width."""
+    of_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
+    for run_status in found:
+        of_cell[run_status.run.cell.id].append(run_status)
+    rows = [_cell_row(cell, of_cell[cell.id]) for cell in manifest.cells]
+    table = Table(title=Text(manifest.name), title_justify="left")
+    for column in rows[0]:
+        table.add_column(column, justify="left" if column in ("cell", "id") else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row.values()))
+    if console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum <= console.width:
+        console.print(table)
+        return
+    say(manifest.name)
+    for row in rows:
+        say(row["cell"])
+        say("  " + ", ".join(f"{column} {text}" for column, text in row.items() if text and column != "cell"))
+
+
+def _cell_row(cell: Cell, found: Sequence[RunStatus]) -> dict[str, str]:
+    counts = Counter(run_status.condition for run_status in found)
+    steps, of_all = (sum(getattr(one, name) for one in found) for name in ("steps", "budget_steps"))
+    return {
+        "cell": cell.label, "id": cell.id, "done": f"{counts['done']}/{len(found)}",
+        **{condition: str(counts[condition] or "") for condition in ("running", "waiting", "failed")},
+        "steps": f"{steps / max(1, of_all):.0%} of {of_all:,}",
+    }  # fmt: skip
+
+
+def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
+    """What is wrong with the runs that failed or wait for another attempt; with `by_cause` all of them, by cause."""
+    unwell = [run_status for run_status in found if run_status.cause is not None and run_status.condition != "done"]
+    if by_cause:
+        for cause, count in sorted(Counter(run_status.cause for run_status in unwell if run_status.cause).items()):
+            say(f"{cause.in_words}: {count}")
+            for run_status in unwell:
+                if run_status.cause is cause:
+                    run = run_status.run
+                    say(f"  {run.title} ({run.cell.id}): {run_status.condition}; {_last(run_status)}")
+        return
+    for run_status in unwell[:_SHOWN_RUNS]:
+        say(f"{run_status.run.title}: {run_status.in_words}; {_last(run_status)}")
+    if len(unwell) > _SHOWN_RUNS:
+        say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
+
+
+def _last(run_status: RunStatus) -> str:
+    lines = run_status.detail.splitlines()
+    return lines[0][:300] if lines else "no more is known"
+
+
+def summary(manifest: Manifest, found: Sequence[RunStatus]) -> str:
+    """How many runs are done, running, waiting and failed."""
+    counts = Counter(run_status.condition for run_status in found)
+    parts = [f"{counts[condition]} {condition}" for condition in ("running", "waiting", "failed") if counts[condition]]
+    other = sum(run_status.other_code for run_status in found)
+    parts += [f"{other} of the done ones by another version of this package"] if other else []
+    return ", ".join([f"{manifest.name}: {counts['done']} of {len(found)} runs done", *parts])
+
+
+def workers_in_words(place: Grid, queue: Queue | None) -> str:
+    """Who works on the grid: what Slurm says of its jobs, or whether anybody does."""
+    if queue is not None:
+        return f"\n{queue.in_words()}"
+    return "" if place.owner_alive() else "; nobody is working on it now"
+
+
+def tell(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> int:
+    """Say how a grid ended; returns the exit code."""
+    from space_dist.experiment.status import exit_code
+
+    print_failures(found, by_cause=False)
+    say(f"{summary(manifest, found)}. {place.folder}")
+    return exit_code(found)
+
+
+def status_json(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> dict[str, Any]:
+    """How every run stands, for programs."""
+    return {
+        "grid": manifest.name, "folder": str(place.folder), "owner_alive": place.owner_alive(),
+        "counts": dict(Counter(run_status.condition for run_status in found)),
+        "runs": [
+            {
+                "cell": run_status.run.cell.id, "label": run_status.run.cell.label, "seed": run_status.run.seed,
+                "condition": run_status.condition, "cause": run_status.cause, "detail": run_status.detail,
+                "steps": run_status.steps, "budget_steps": run_status.budget_steps, "attempts": run_status.attempts,
+                "other_code": run_status.other_code, "folder": str(run_status.ledger.folder),
+            }
+            for run_status in found
+        ],
+    }  # fmt: skip
