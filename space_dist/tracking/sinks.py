@@ -5,20 +5,23 @@ A sink is fed by the process that pushes, from what ledgers hold: nothing of tra
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from space_dist.config.sections import Sink as SinkName
 from space_dist.errors import ConfigError
-from space_dist.system.files import atomic_write, read_file
+from space_dist.system.files import atomic_write, locked, read_file
 from space_dist.tracking.snapshot import Record
 
 _PACKAGES: Final[Mapping[SinkName, str]] = {"tensorboard": "tensorboard", "wandb": "wandb"}
+_LOCK: Final = "tracking.lock"
+_TURN_SECONDS: Final = 600.0
 _STATE: Final = "synced.json"
 _MAX_STATE: Final = 10_000  # bytes
 
@@ -60,6 +63,17 @@ def sink_of(name: SinkName) -> Sink:
     from space_dist.tracking.wandb import WeightsAndBiases
 
     return WeightsAndBiases()
+
+
+@contextlib.contextmanager
+def turn(folder: Path) -> Iterator[None]:
+    """Be the only one who writes into a sink's folder, which is made. Waits for others; whoever dies lets go at once.
+
+    Raises OSError where it cannot be written, or nobody lets go.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder / _LOCK, _TURN_SECONDS):
+        yield
 
 
 def read_synced(folder: Path) -> Synced:

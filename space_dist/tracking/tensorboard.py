@@ -10,7 +10,7 @@ import os
 from typing import TYPE_CHECKING, Final
 
 from space_dist.system.files import open_own
-from space_dist.tracking.sinks import Synced, note_synced, read_synced
+from space_dist.tracking.sinks import Synced, note_synced, read_synced, turn
 from space_dist.tracking.snapshot import Point, Record
 
 if TYPE_CHECKING:
@@ -25,6 +25,10 @@ class TensorBoard:
 
     def push(self, record: Record) -> None:
         """Add the rows that are not there. Raises OSError where the folder cannot be written."""
+        with turn(record.root / FOLDER):
+            self._push(record)
+
+    def _push(self, record: Record) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
         from tensorboard.summary.writer.record_writer import RecordWriter
 

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, Final
 
-from space_dist.tracking.sinks import Synced, note_synced, read_synced
+from space_dist.tracking.sinks import Synced, note_synced, read_synced, turn
 from space_dist.tracking.snapshot import NOTE_TAG, Record
 
 FOLDER: Final = "wandb"
@@ -25,6 +25,10 @@ class WeightsAndBiases:
         """Write it whole, unless it is under way, or there. Raises OSError where the folder cannot be written."""
         if record.mlflow_status == "RUNNING":
             return
+        with turn(record.root / FOLDER):
+            self._push(record)
+
+    def _push(self, record: Record) -> None:
         folder = record.root / FOLDER / record.name
         points = [*record.points(0)]
         now = Synced(points[-1][0] if points else 0, record.intent, record.mlflow_status)
@@ -48,10 +52,13 @@ class WeightsAndBiases:
             x_disable_stats=True, x_disable_meta=True, x_disable_machine_info=True,
         )  # fmt: skip
         config = {**record.params, "seed": record.tags.get("space_dist.seed", "")}
-        run: Any = wandb.init(
-            project=_PROJECT, id=record.key, name=record.title, group=record.group[:128], dir=folder,
-            notes=record.tags.get(NOTE_TAG), config=config, settings=settings, reinit="create_new",
-        )  # fmt: skip
+        try:
+            run: Any = wandb.init(
+                project=_PROJECT, id=record.key, name=record.title, group=record.group[:128], dir=folder,
+                notes=record.tags.get(NOTE_TAG), config=config, settings=settings, reinit="create_new",
+            )  # fmt: skip
+        except wandb.Error as error:
+            raise OSError(f"Weights & Biases writes no run: {error}") from error
         try:
             run.define_metric("steps")
             run.define_metric("*", step_metric="steps")
