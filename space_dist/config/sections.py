@@ -13,7 +13,7 @@ from space_dist.system.importing import why_refused
 MAX_LIST = 10_000  # values of a list in a config
 Sink = Literal["tensorboard", "wandb"]
 SINKS: tuple[Sink, ...] = get_args(Sink)
-_MAX_WORKERS = 4096
+_MAX_WORKERS = 4096  # as many as there may be shards
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
