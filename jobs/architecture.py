@@ -31,9 +31,9 @@ KEY: Final = "Description"  # of the text in the PNG
 _STEP: Final = (0.45, 0.58)  # inches from place to place, and from row to row
 _BOX: Final = (1.15, 0.34)  # inches
 PLACES: Final = {  # of the boxes in their rows, searched for with few crossings and no arrow over a box
-    "cli": 3, "slurm": 1, "grid": 5, "sb3": 3, "run": 4, "tracking": 3, "report": 2, "experiment": 0, "learner": 14,
-    "rollout": 10, "envs": 10, "curricula": 7, "instances": 11, "ledger": 1, "config": 0, "system": 3, "kernels": 12,
-    "seeding": 6, "errors": 6, "arithmetic": 14,
+    "cli": 3, "api": 5, "slurm": 1, "grid": 5, "sb3": 3, "run": 4, "tracking": 3, "report": 2, "experiment": 0,
+    "learner": 15, "rollout": 10, "envs": 10, "curricula": 7, "instances": 13, "ledger": 1, "config": 0, "system": 3,
+    "kernels": 11, "seeding": 6, "errors": 6, "arithmetic": 15,
 }  # fmt: skip
 _INK, _ARROW, _STRIPES = "#1a1a1a", "#4d4d4d", ("#f4f4f4", "#e9e9e9")
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from space_dist.cli.grids import frozen, run_frozen
+from space_dist.api.grids import frozen
+from space_dist.cli.grids import run_frozen
 from space_dist.cli.overview import tell
 from space_dist.cli.runs import print_grid_report
 from space_dist.cli.terminal import STOP, console, say, warn

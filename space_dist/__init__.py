@@ -1,6 +1,11 @@
-"""space_dist: reinforcement learning that generalises over instances, with self-paced curricula, on Ray."""
+"""space_dist: reinforcement learning that generalises over instances, with self-paced curricula, on Ray.
 
+What scripts and notebooks use of it is here by name (docs/python.md), and imported when it is first asked for.
+"""
+
+import importlib
 import sys
+from typing import TYPE_CHECKING
 
 if sys.argv[:1] == ["-m"] and not sys.flags.safe_path and any("space_dist." in word for word in sys.orig_argv[1:]):
     # `python -m space_dist.cli` has Python look into the current folder before its own library: see `importing`.
@@ -12,5 +17,53 @@ arithmetic.settle()  # before any library is loaded that chooses its kernels by 
 
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError  # noqa: E402
 
+if TYPE_CHECKING:
+    from space_dist.api import ActingPolicy, GridRun, ReportView, Run, load_policy, report_on, run_grid, train
+    from space_dist.config import RunConfig
+    from space_dist.instances import InstanceSet
+    from space_dist.sb3 import ContextVecEnv, CurriculumCallback
+
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "Interrupted", "LedgerError", "RunLockedError", "SpaceDistError", "__version__"]
+__all__ = [
+    "ActingPolicy",
+    "ConfigError",
+    "ContextVecEnv",
+    "CurriculumCallback",
+    "GridRun",
+    "InstanceSet",
+    "Interrupted",
+    "LedgerError",
+    "ReportView",
+    "Run",
+    "RunConfig",
+    "RunLockedError",
+    "SpaceDistError",
+    "__version__",
+    "load_policy",
+    "report_on",
+    "run_grid",
+    "train",
+]
+
+_HOMES = {
+    **dict.fromkeys(
+        ("ActingPolicy", "GridRun", "ReportView", "Run", "load_policy", "report_on", "run_grid", "train"),
+        "space_dist.api",
+    ),
+    "ContextVecEnv": "space_dist.sb3",
+    "CurriculumCallback": "space_dist.sb3",
+    "InstanceSet": "space_dist.instances",
+    "RunConfig": "space_dist.config",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found: object = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

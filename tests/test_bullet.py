@@ -233,7 +233,7 @@ def test_an_action_that_is_no_number_is_refused(env_id: str) -> None:
 def test_a_missing_pybullet_is_a_sentence(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     bullet.pybullet.cache_clear()  # as in a process that has not imported it yet
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(ConfigError, match=rf"^env.id {env_id!r}: it needs the package pybullet"):
+    with pytest.raises(ConfigError, match=rf"^env.id {env_id!r}: this environment needs PyBullet: pip install"):
         make_batched(env_id, 1, context_visible=False)
     bullet.pybullet.cache_clear()
 

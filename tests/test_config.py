@@ -629,10 +629,11 @@ OTHER_WORDS = {
     "curriculum.column": "effort",
     "curriculum.import": "my_package.my_module:Other",
     "learner.import": "my_package.my_module:Other",
+    "init_from": "runs/other/s0",
 }
 # What decides no result, and so is no part of a run's identity: when it is saved, where it is mirrored, what it runs
-# on, and where its instance files lie (their content enters by digest).
-UNIDENTIFYING = (*NOT_IDENTITY, "instances")
+# on, and where its instance files, and the networks it starts from, lie (their content enters by digest).
+UNIDENTIFYING = (*NOT_IDENTITY, "instances", "init_from")
 # What must be set for another value to be valid, where none is: multiplying by a kappa of 1 is refused, and so are
 # rounds of whole episodes in more than one slot.
 COMPANIONS: dict[str, dict[str, Any]] = {

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from space_dist.cli.terminal import keep_outputs, warn  # isort: skip - before anything heavy
+from space_dist.cli.terminal import keep_outputs, say, warn  # isort: skip - before anything heavy
 
 import os
 import sys
+from typing import Annotated
 
 import typer
 
+from space_dist import __version__
 from space_dist.arithmetic import overruled
-from space_dist.cli import runs
+from space_dist.cli import runs, starting
 from space_dist.cli.curricula import curriculum_app
 from space_dist.cli.grids import grid_app
+from space_dist.cli.health import doctor
 from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
 from space_dist.cli.worlds import env_app, render
@@ -20,10 +23,13 @@ from space_dist.errors import SpaceDistError
 from space_dist.system.importing import look_here_too
 
 app = typer.Typer(
-    name="space-dist", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    name="space-dist", no_args_is_help=True, pretty_exceptions_enable=False,
     help="Self-paced curricula for contextual reinforcement learning.",
 )  # fmt: skip
-for _command in (runs.train, runs.evaluate, runs.explain, runs.report, runs.sync, runs.export_sb3, render):
+for _command in (
+    starting.init, starting.configs, runs.train, runs.evaluate, runs.explain, runs.report, runs.sync, runs.export_sb3,
+    render, doctor,
+):  # fmt: skip
     app.command()(_command)
 app.add_typer(grid_app, name="grid")
 app.add_typer(slurm_app, name="slurm")
@@ -31,6 +37,21 @@ app.add_typer(instances_app, name="instances")
 app.add_typer(config_app, name="config")
 app.add_typer(env_app, name="env")
 app.add_typer(curriculum_app, name="curriculum")
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        say(f"space-dist {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Tell the version.")
+    ] = False,
+) -> None:
+    pass
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ import typer
 from space_dist.cli.overview import display, print_cells, print_failures, status_json, summary, tell, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile
 
 if TYPE_CHECKING:
@@ -111,6 +112,8 @@ def grid_run(
     """Work through a grid: skip what is done, go on with what is not, retry by cause."""
     chosen = _mode(mode)
     _prepare(address)
+    from space_dist.api.grids import frozen
+
     place, manifest = frozen(grid, _root(root))
     if digest is not None and digest != manifest.runs_digest:
         raise ConfigError(
@@ -145,7 +148,9 @@ def grid_submit(
 ) -> None:
     """Submit a grid to a Ray cluster. Submitted twice, it still runs once."""
     STOP.install()
-    from space_dist.grid.jobs import Remote
+    with needed_from("ray", "`grid submit`"):
+        from space_dist.grid.jobs import Remote
+    from space_dist.api.grids import frozen
 
     chosen = _mode(mode)
     limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
@@ -294,7 +299,9 @@ def grid_work(
     """One attempt of one run, or of several in one process, as a job of its own."""
     STOP.install()
     from space_dist.experiment.endings import AskedBy, Cause
-    from space_dist.grid.pool import refuse_other_folder
+
+    with needed_from("ray", "a Ray job"):
+        from space_dist.grid.pool import refuse_other_folder
     from space_dist.grid.supervisor import AttemptId, Supervisor, Task, preload
     from space_dist.system.workplace import lasting
 
@@ -323,8 +330,8 @@ def run_frozen(
 ) -> list[RunStatus]:  # fmt: skip
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
     _prepare(address)
-    from space_dist.grid.conductor import Conductor, working_on
-    from space_dist.grid.warm import LocalExecutor, local_is_enough
+    from space_dist.api.grids import worked_through
+    from space_dist.grid.conductor import working_on
 
     runs = _part(manifest.runs(), part)
     _log_to(place)
@@ -332,16 +339,9 @@ def run_frozen(
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
         observe = stack.enter_context(display(manifest, place))
-        if address == "local" and local_is_enough(manifest, runs, max_parallel):
-            here = stack.enter_context(LocalExecutor(place, manifest, STOP.reason))
-            return Conductor(
-                place, manifest, runs, here, stop_requested=STOP.reason, observe=observe
-            ).conduct()  # fmt: skip
-        from space_dist.grid.jobs import conduct
-
-        return conduct(
+        return worked_through(
             place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
-            stop_requested=STOP.reason, reinstall=STOP.install, observe=observe,
+            stop=STOP, reinstall=STOP.install, observe=observe,
         )  # fmt: skip
 
 
@@ -361,21 +361,6 @@ def _root(root: Path | None) -> Path:
     from space_dist.system.workplace import lasting, workplace
 
     return workplace() / "runs" if root is None else lasting(root, "--root")
-
-
-def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
-    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
-    from space_dist.experiment.manifest import MANIFEST, find_grid
-    from space_dist.grid.conductor import adopt
-
-    if path.is_dir() or path.name == MANIFEST:
-        source = find_grid(path, root)
-        place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
-        return place, place.manifest()
-    from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
-
-    made = plan(path, root)
-    return made.grid, made.manifest
 
 
 def _found(path: Path, root: Path | None) -> tuple[Grid, Manifest]:
@@ -425,7 +410,8 @@ def _log_to(place: Grid) -> None:
 
 def _conductor(place: Grid, manifest: Manifest, address: str) -> tuple[Remote, JobDetails]:
     """The job that conducts a grid on the cluster at `address`. Raises SpaceDistError if there was none."""
-    from space_dist.grid.jobs import Remote
+    with needed_from("ray", f"--address {address}"):
+        from space_dist.grid.jobs import Remote
 
     remote = Remote(address, manifest, place.folder.parent)
     conductor = remote.conductor()

@@ -56,10 +56,12 @@ def instances_check(
     ] = None,
 ) -> None:
     """Check instance files and show what is in them."""
+    from space_dist.config import located
     from space_dist.envs.spec import read_spec
     from space_dist.instances import read_csv, refuse_overlap, summary
 
     bounds = read_spec(env, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
+    files = [located(file) for file in files]
     sets = [read_csv(file, bounds, columns or (), if_there=True) for file in files]
     for index, one in enumerate(sets):
         for other in range(index):

@@ -27,7 +27,6 @@ _REPORT_WIDTH = 200  # characters
 _GRID_WIDTH = 150
 _MAX_CELLS_SHOWN = 60
 _LINE_SECONDS = 10.0  # between lines of progress
-_YAML = (".yaml", ".yml")
 
 
 def train(
@@ -76,6 +75,7 @@ def evaluate(
     """Evaluate a run's policy, deterministically, on any instances of its environment."""
     import numpy as np
 
+    from space_dist.config import located
     from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
     from space_dist.ledger import Ledger
@@ -92,7 +92,7 @@ def evaluate(
     config = stored_config(ledger)
     spec = spec_of(config)
     policies = policies_of(policy_of(ledger, spec))
-    chosen = read_csv(instances, spec.context_bounds, config.curriculum.columns_read, if_there=True)
+    chosen = read_csv(located(instances), spec.context_bounds, config.curriculum.columns_read, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     optimum = None
     with exits_refused(), spec.opened(len(chosen)) as env:
@@ -192,24 +192,21 @@ def report(
     ] = None,
 ) -> None:
     """Compare runs, or the cells of a grid: figures and tables with 95 % intervals over seeds."""
+    from space_dist.api.reports import is_grid
+    from space_dist.config import located
     from space_dist.ledger import find_ledgers
     from space_dist.report import build_grid_report, build_report
 
-    if len(paths) == 1 and _is_grid(paths[0]):
+    paths = [located(path) for path in paths]
+    if len(paths) == 1 and is_grid(paths[0]):
         grid = _grid(paths[0], root)
         print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
         return
-    if grids := [path for path in paths if _is_grid(path)]:
+    if grids := [path for path in paths if is_grid(path)]:
         raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
     if baseline is not None or threshold is not None:
         raise ConfigError(f"--baseline and --threshold are for grids; {paths[0]} is none")
     print_report(build_report(find_ledgers(paths), Path("report") if out is None else out), console)
-
-
-def _is_grid(path: Path) -> bool:
-    from space_dist.experiment.manifest import MANIFEST
-
-    return (path / MANIFEST).is_file() or (not path.is_dir() and (path.name == MANIFEST or path.suffix in _YAML))
 
 
 def _grid(path: Path, root: Path | None) -> Grid:
@@ -280,12 +277,14 @@ def sync(
     root: Annotated[Path, typer.Option(help="Where the grids of YAML files are.")] = Path("runs"),
 ) -> None:
     """Replay runs and grids into MLflow. Doing it twice changes nothing."""
+    from space_dist.config import located
     from space_dist.experiment.manifest import find_grid
     from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs
 
-    paths = [find_grid(path, root).folder if path.is_file() else path for path in runs]
+    named = [located(path) for path in runs]
+    paths = [find_grid(path, root).folder if path.is_file() else path for path in named]
     found = find(paths)
     if follow:
         result = follow_runs(paths, uri, experiment)

@@ -4,6 +4,7 @@
     explaining, identities                   the schema and its faults in sentences; what of a config decides results
     run                                      a whole config, and what its sections must agree about
     curriculum, learner, sections            its sections
+    shipped                                  what comes with the package
     plain_yaml, tracking_uri, quoting        what is not about runs
 
 Each imports from those below it.
@@ -40,9 +41,20 @@ from space_dist.config.learner import (
     TRPOConfig,
     learners_that,
 )
-from space_dist.config.plain_yaml import read_yaml, to_yaml
+from space_dist.config.plain_yaml import plain, read_yaml, to_yaml
 from space_dist.config.quoting import clean
-from space_dist.config.reading import apply_override, check, dump, from_folder, load, parse, put, read
+from space_dist.config.reading import (
+    apply_override,
+    beside,
+    check,
+    dump,
+    from_folder,
+    from_its_folder,
+    load,
+    parse,
+    put,
+    read,
+)
 from space_dist.config.run import RunConfig
 from space_dist.config.sections import (
     NAME,
@@ -57,6 +69,7 @@ from space_dist.config.sections import (
     Section,
     TrackingConfig,
 )
+from space_dist.config.shipped import about_shipped, located, shipped_files, with_what_it_names
 
 __all__ = [
     "NAME",
@@ -94,7 +107,9 @@ __all__ = [
     "TrackingConfig",
     "UniformConfig",
     "ValueDisagreementConfig",
+    "about_shipped",
     "apply_override",
+    "beside",
     "changes",
     "check",
     "clean",
@@ -102,13 +117,18 @@ __all__ = [
     "dump",
     "flattened",
     "from_folder",
+    "from_its_folder",
     "identity",
     "learners_that",
     "load",
+    "located",
     "parse",
+    "plain",
     "put",
     "read",
     "read_yaml",
     "schema",
+    "shipped_files",
     "to_yaml",
+    "with_what_it_names",
 ]

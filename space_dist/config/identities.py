@@ -14,17 +14,20 @@ NOT_IDENTITY = ("name", "checkpoint", "tracking", "resources")  # what cannot ch
 
 
 def identity(
-    config: RunConfig, train_digest: str, test_digest: str, *, sources: Mapping[str, str] = MappingProxyType({}),
-    with_seed: bool = True,
+    config: RunConfig, train_digest: str, test_digest: str, *, weights: bytes | None = None,
+    sources: Mapping[str, str] = MappingProxyType({}), with_seed: bool = True,
 ) -> str:  # fmt: skip
     """`(64 hex digits)` a hash of everything that decides the run's results; without its seed, that of a grid's cell.
 
-    Instance files count by their content, and so does a user's own code: `sources`, by import path. Fields at their
-    default are left out, so that a field that is added later changes no identity.
+    Instance files count by their content, and so do the `weights` that `init_from` names, and a user's own code:
+    `sources`, by import path. Fields at their default are left out, so that a field that is added later changes no
+    identity.
     """
-    exclude = {*NOT_IDENTITY, "seed"}
+    exclude = {*NOT_IDENTITY, "seed", "init_from"}
     data = config.model_dump(mode="json", exclude=exclude, exclude_defaults=True)
     data["instances"] = {"train": train_digest, "test": test_digest}
+    if weights is not None:
+        data["init_from"] = hashlib.sha256(weights).hexdigest()
     if sources:
         data["sources"] = dict(sources)
     if with_seed:
@@ -33,8 +36,8 @@ def identity(
 
 
 def differences(one: RunConfig, other: RunConfig) -> list[str]:
-    """`key: value -> value` for every key that decides results and differs; instance paths are left out."""
-    exclude = {*NOT_IDENTITY, "instances"}
+    """`key: value -> value` for every key that decides results and differs; paths are left out."""
+    exclude = {*NOT_IDENTITY, "instances", "init_from"}
     changed = changes(one.model_dump(mode="json", exclude=exclude), other.model_dump(mode="json", exclude=exclude))
     return [f"{key}: {before} -> {after}" for key, (before, after) in changed.items()]
 

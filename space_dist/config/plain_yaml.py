@@ -103,6 +103,20 @@ def parse_yaml(content: bytes | str, source: str) -> Any:
         raise ConfigError(f"{source} is not valid YAML: {clean(str(error))}") from None
 
 
+def plain(data: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """What a program wrote, as if it had been read from YAML: a copy, of what JSON knows alone.
+
+    Raises ConfigError that begins with `source`, and names the key, for anything else.
+    """
+    try:
+        found: dict[str, Any] = _plain(dict(data))
+    except RecursionError:
+        raise ConfigError(f"{source} is nested too deeply") from None
+    except ValueError as error:
+        raise ConfigError(f"{source}: {error}") from None
+    return found
+
+
 @functools.lru_cache(maxsize=64)
 def _loaded(text: str, source: str) -> Any:
     """What a YAML text says, for `_plain` to copy: ten milliseconds for a run's, which is read several times."""

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from space_dist.config.explaining import explain
 from space_dist.config.plain_yaml import parse_yaml, read_yaml, to_yaml
 from space_dist.config.run import RunConfig
+from space_dist.config.shipped import PREFIX, located
 from space_dist.errors import ConfigError
 
 _M = TypeVar("_M", bound=BaseModel)
@@ -32,19 +33,34 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A run's config as plain data, not checked yet; relative instance paths become absolute, from its folder."""
-    data = read_yaml(path)
+    """A run's config as plain data, not checked yet; relative paths in it become absolute, from its folder."""
+    place = located(path)
+    data = read_yaml(place)
     if "extends" in data and "env" not in data:
         raise ConfigError(f"{path} is a grid, of many runs: space-dist grid run {path}")
+    from_its_folder(data, place.absolute().parent)
+    return data
+
+
+def from_its_folder(data: dict[str, Any], folder: Path) -> None:
+    """Take the relative paths in a run's plain data from `folder`."""
+    if "init_from" in data:
+        data["init_from"] = beside(data["init_from"], folder)
     instances = data.get("instances")
     if isinstance(instances, dict):
-        data["instances"] = from_folder(instances, path.absolute().parent)
-    return data
+        data["instances"] = from_folder(instances, folder)
 
 
 def from_folder(instances: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The `instances` section with its relative paths taken from `folder`."""
-    return {key: str(folder / value) if isinstance(value, str) and value else value for key, value in instances.items()}
+    return {key: beside(value, folder) for key, value in instances.items()}
+
+
+def beside(value: Any, folder: Path) -> Any:
+    """A path in a config, relative to `folder` or `shipped:NAME`, as an absolute one; what is no path as it is."""
+    if not isinstance(value, str) or not value:
+        return value
+    return str(located(value)) if value.startswith(PREFIX) else str(folder / value)
 
 
 def parse(data: Mapping[str, Any], source: str, origins: Mapping[str, str] | None = None) -> RunConfig:
@@ -84,13 +100,13 @@ def apply_override(data: dict[str, Any], override: str) -> None:
     if not equals or not all(parts) or not override.isprintable():
         raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
     value = parse_yaml(text, f"--set {override}")
-    if parts[0] == "instances":
+    if parts[0] in ("instances", "init_from"):
         value = _from_here(value)
     put(data, ".".join(parts), value, f"--set {override}")
 
 
 def _from_here(value: Any) -> Any:
-    """Instance paths of an override, relative to the current folder, as absolute ones."""
+    """Paths of an override, relative to the current folder, as absolute ones."""
     if isinstance(value, dict):
         return {key: _from_here(item) for key, item in value.items()}
-    return str(Path(value).absolute()) if isinstance(value, str) and value else value
+    return beside(value, Path.cwd())

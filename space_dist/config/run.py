@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -41,6 +42,9 @@ class RunConfig(Section):
     """Whose bits results have. one: the same on every x86-64 CPU with AVX2 and FMA. native: those of the kernels that
     libraries choose by the CPU, in processes that have SPACE_DIST_ARITHMETIC=native in their environment. Part of what
     a run is."""
+    init_from: Path | None = Field(default=None, strict=False)
+    """Folder of a run whose last networks this one starts from; its optimisers and its curriculum are fresh. A relative
+    path is relative to this config file. It counts by its content, of which the run keeps a copy. null: fresh ones."""
     env: EnvConfig
     instances: InstancesConfig
     curriculum: CurriculumConfig

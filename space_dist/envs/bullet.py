@@ -26,8 +26,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.interface import FloatArray, IntArray, Step
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import SpaceDistError
 from space_dist.instances import ContextBounds
+from space_dist.system.extras import needed_from
 
 MAX_WORLDS = 32
 """Worlds of one batched environment, at most: about 1 GB. PyBullet itself allows 1,024 clients in a process.
@@ -44,11 +45,8 @@ def pybullet() -> Any:
 
     Raises ConfigError where it is not installed.
     """
-    with _without_greeting():
-        try:
-            import pybullet as module
-        except ImportError as error:
-            raise ConfigError(f"it needs the package pybullet, which cannot be imported: {error}") from None
+    with _without_greeting(), needed_from("bullet", "this environment"):
+        import pybullet as module
     return module
 
 

@@ -205,12 +205,13 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
 
     Relative paths in the grid file are relative to it. Raises ConfigError with file and key of every fault.
     """
-    data = configs.read_yaml(path)
+    place = configs.located(path)
+    data = configs.read_yaml(place)
     if "env" in data and "extends" not in data:
         raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
     grid = configs.check(GridConfig, data, str(path))
-    folder = path.absolute().parent
-    bases = {base: configs.read(folder / base) for base in grid.extends}
+    folder = place.absolute().parent
+    bases = {base: configs.read(Path(configs.beside(base, folder))) for base in grid.extends}
     n_runs = len(grid.seed_list())
     cells: list[tuple[dict[str, Any], dict[str, Any]]] = []
     try:
@@ -221,7 +222,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
             for key, value in (*grid.set.items(), *point.items()):
                 if key == "extends":
                     continue
-                here = _from_folder(value, folder) if key.partition(".")[0] == "instances" else value
+                here = _from_folder(value, folder) if key.partition(".")[0] in ("instances", "init_from") else value
                 configs.put(data, key, json.loads(json.dumps(here)), key)
             cells.append((point, data))
     except ConfigError as error:
@@ -234,7 +235,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
 def _from_folder(value: Any, folder: Path) -> Any:
     if isinstance(value, dict):
         return configs.from_folder(value, folder)
-    return str(folder / value) if isinstance(value, str) and value else value
+    return configs.beside(value, folder)
 
 
 def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:
@@ -475,10 +476,10 @@ class Grid:
         data = {
             **run.cell.config,
             "seed": run.seed,
-            "instances": configs.from_folder(run.cell.config["instances"], self.folder),
             "resources": resources,
             "tracking": {"uri": manifest.tracking.uri, "experiment": manifest.experiment, "live": False},
         }
+        configs.from_its_folder(data, self.folder)
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")
 
 
@@ -493,7 +494,7 @@ def find_grid(path: Path, root: Path) -> Grid:
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
-    grid = Grid(root / configs.check(GridConfig, configs.read_yaml(path), str(path)).name)
+    grid = Grid(root / configs.check(GridConfig, configs.read_yaml(configs.located(path)), str(path)).name)
     if not grid.manifest_file.exists():
         raise LedgerError(
             f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}` freezes it there "

@@ -16,6 +16,7 @@ from space_dist.experiment.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfi
 from space_dist.grid.conductor import freeze
 from space_dist.instances import InstanceSet
 from space_dist.run.building import Blueprint
+from space_dist.run.starting import weights_in
 from space_dist.system.provenance import code_digest, git_state, source_digest
 from space_dist.system.workplace import absolute_uri
 
@@ -78,6 +79,12 @@ class _InstanceFiles:
             self._read[key] = blueprint.instances()
         return self._read[key]
 
+    def kept(self, weights: bytes) -> str:
+        """The name under which what a cell starts from (`init_from`) lies beside them."""
+        name = f"{hashlib.sha256(weights).hexdigest()[:16]}.npz"
+        self.contents[name] = weights
+        return name
+
     def name(self, instances: InstanceSet) -> str:
         if id(instances) not in self._names:  # `_read` keeps them all alive
             name = f"{instances.digest()[:16]}.csv"
@@ -107,10 +114,15 @@ def _cell(
         train, test = files.sets(blueprint)
         blueprint.setup(train, test)
         sources = {path: source_digest(path) for path in config.import_paths}
-    identity = configs.identity(config, train.digest(), test.digest(), sources=sources, with_seed=False)
+    weights = None if config.init_from is None else weights_in(config.init_from)
+    identity = configs.identity(
+        config, train.digest(), test.digest(), weights=weights, sources=sources, with_seed=False
+    )  # fmt: skip
     data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
     data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
                              (("train", train), ("test", test))}  # fmt: skip
+    if weights is not None:
+        data["init_from"] = f"instances/{files.kept(weights)}"
     cell = Cell(identity[:CELL_ID_DIGITS], label, point, data, blueprint.stack, blueprint.memory)
     return cell, blueprint.total_steps
 

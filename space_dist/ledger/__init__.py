@@ -1,6 +1,7 @@
 """A run's own folder: the truth about it.
 
-    config.yaml           what was asked for, resolved; with instances_train.csv and instances_test.csv beside it
+    config.yaml           what was asked for, resolved; with instances_train.csv and instances_test.csv beside it, and
+                          init.npz, the networks it started from, where the config has an init_from
     status.json           where the run stands (atomic); names the last checkpoint, how much of each file it covers, and
                           the hashes of the files that are written whole
     metrics.jsonl         one row per iteration and per evaluation; a pure function of config and seed
@@ -28,7 +29,15 @@ Modules, each of which imports from those below it:
 
 from __future__ import annotations
 
-from space_dist.ledger.checkpoint import FORMAT, Checkpoint, Segment, decode_checkpoint, encode_checkpoint
+from space_dist.ledger.checkpoint import (
+    FORMAT,
+    Checkpoint,
+    Segment,
+    decode_arrays,
+    decode_checkpoint,
+    encode_arrays,
+    encode_checkpoint,
+)
 from space_dist.ledger.folder import Ledger, State, Status, find_ledgers
 from space_dist.ledger.lock import LEASE_SECONDS, Lock, believed_alive, owner_alive, process_of, this_process
 from space_dist.ledger.rows import (
@@ -64,9 +73,11 @@ __all__ = [
     "State",
     "Status",
     "believed_alive",
+    "decode_arrays",
     "decode_checkpoint",
     "decode_row",
     "decode_values",
+    "encode_arrays",
     "encode_checkpoint",
     "encode_row",
     "encode_values",

@@ -65,6 +65,7 @@ class Ledger:
         self.log = self.folder / "log.txt"
         self.stop_file = self.folder / "stop"
         self.lock_file = self.folder / "lock.json"
+        self.initial_weights = self.folder / "init.npz"
         self.model_arrays = self.folder / "model.npz"
         self.model_description = self.folder / "model.json"
 

@@ -11,7 +11,7 @@ import logging
 import os
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -68,7 +68,7 @@ class RunWriter:
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def write_config(self, config: str, train: str, test: str) -> None:
+    def write_config(self, config: str, train: str, test: str, weights: bytes | None = None) -> None:
         """Record what was asked for. The config comes last: a folder that has one is complete.
 
         Where there is a status, it names both the old and the new content until the next one is written.
@@ -76,6 +76,7 @@ class RunWriter:
         asked = {
             self.ledger.instances("train"): train.encode(),
             self.ledger.instances("test"): test.encode(),
+            **({} if weights is None else {self.ledger.initial_weights: weights}),
             self.ledger.config: config.encode(),
         }
         with _clear_errors(self.ledger.folder), self._lock.held():
@@ -87,6 +88,41 @@ class RunWriter:
             for path, content in asked.items():
                 atomic_write(path, content)
             self._files |= {name: [sha256] for name, sha256 in hashes.items()}
+
+    def hand_over(self, status: Status, keep: Callable[[Checkpoint], bool]) -> Status:
+        """Make this a run of another identity, `status.identity`: the checkpoints that `keep` are its own from now on.
+
+        The others are forgotten. Returns where it stands then. Interrupted at any moment, it can be done again.
+        """
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            newest: Path | None = None
+            forgotten = []
+            for file in self.ledger.checkpoint_files():
+                try:
+                    checkpoint = decode_checkpoint(self._intact_or_refused(file))
+                except ValueError:
+                    continue  # `restore` says so
+                if not keep(checkpoint):
+                    forgotten.append(file)
+                    continue
+                about = {**checkpoint.data.get("about", {}), "identity": status.identity}
+                content = encode_checkpoint(dataclasses.replace(checkpoint, data={**checkpoint.data, "about": about}))
+                atomic_write(file, content)
+                if newest is None:
+                    newest = file
+                    sizes = {name: size for name, (size, _) in rows_under(checkpoint).items()}
+                    status = dataclasses.replace(
+                        status, round=checkpoint.round, steps=about.get("steps", 0), committed=sizes,
+                        checkpoint=file.name, checkpoint_sha256=hashlib.sha256(content).hexdigest(),
+                    )  # fmt: skip
+            if newest is None:
+                status = dataclasses.replace(
+                    status, round=0, steps=0, committed={}, checkpoint=None, checkpoint_sha256=None
+                )  # fmt: skip
+            self._write_status(status)
+            for file in forgotten:
+                file.unlink()
+        return status
 
     def restore(self) -> Checkpoint | None:
         """Cut every row file back to the newest intact checkpoint and return it; to nothing where none was written.

@@ -31,6 +31,7 @@ from space_dist.learner import (
 from space_dist.ledger import Checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import MlpPolicy, Policy, Several, to_arrays
+from space_dist.run.starting import start_from, weights_in
 from space_dist.seeding import member_seeds
 
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
@@ -107,6 +108,8 @@ class Blueprint:
         # Asks the curriculum for what is not there? Better refused now than on an actor.
         self._refuse_wants(self.curriculum(train))
         self.ensemble()
+        if config.init_from is not None:
+            start_from(self.learner(), weights_in(config.init_from))
         return setup
 
     def curriculum(self, train: InstanceSet) -> Curriculum:

@@ -41,7 +41,10 @@ from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Cluster, InProcess, n_workers
+from space_dist.run.continuing import is_longer, within
+from space_dist.run.starting import weights_in
 from space_dist.run.training import Progress, Training
+from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import fingerprint
@@ -177,16 +180,17 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
 def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
     config, ledger = blueprint.config, writer.ledger
+    weights = None if config.init_from is None else weights_in(config.init_from)
     now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config), config.import_paths)
     status = Status(
         state="running", name=config.name, seed=config.seed, steps=0, budget_steps=config.budget.steps, round=0,
         started_at=now, updated_at=now, fingerprint=here,
-        identity=configs.identity(config, setup.train.digest(), setup.test.digest()),
+        identity=configs.identity(config, setup.train.digest(), setup.test.digest(), weights=weights),
     )  # fmt: skip
     before = writer.status = _status_before(ledger)
-    _refuse_other_run(config, setup, ledger, status.identity, before)
+    shorter = _refuse_other_run(config, setup, weights, ledger, status.identity, before)
     if before is not None:
-        if before.state == "done":
+        if before.state == "done" and shorter is None:
             damage = ledger.damage()
             if not damage:
                 return before
@@ -202,9 +206,15 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
         status = replace(
             status, steps=before.steps, round=before.round, started_at=before.started_at,
-            fingerprint_changed=before.fingerprint_changed or changed, identity=before.identity or status.identity,
+            fingerprint_changed=before.fingerprint_changed or changed,
+            identity=before.identity if before.identity and shorter is None else status.identity,
         )  # fmt: skip
-    writer.write_config(configs.dump(_self_contained(config)), setup.train.to_csv(), setup.test.to_csv())
+    stored = configs.dump(_self_contained(config))
+    if shorter is not None:
+        now_at = writer.hand_over(status, within(shorter, blueprint.spec.horizon))
+        status = replace(status, steps=now_at.steps, round=now_at.round)
+        log.info("going on under a larger budget, from round %d", status.round)
+    writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
     ledger.stop_file.unlink(missing_ok=True)
     writer.set_status(status)
     return status
@@ -257,23 +267,33 @@ def _status_in(ledger: Ledger) -> Status | None:
 
 
 def _refuse_other_run(
-    config: RunConfig, setup: Setup, ledger: Ledger, identity: str | None, before: Status | None
-) -> None:
-    """Raise ConfigError if the folder holds a run of another configuration, with what differs where that is known."""
+    config: RunConfig, setup: Setup, weights: bytes | None, ledger: Ledger, identity: str | None, before: Status | None
+) -> RunConfig | None:
+    """Raise ConfigError if the folder holds a run of another configuration, with what differs where that is known.
+
+    Returns its config where it is this run with a smaller budget.
+    """
     if before is not None and before.identity == identity:
-        return  # the copies of config and instances in the folder are written anew
+        return None  # the copies of config and instances in the folder are written anew
     if before is None and not ledger.config.exists():
-        return
+        return None
     try:  # the stored config decides as this version reads it, if it is known to be what the run wrote
         stored = configs.load(ledger.config) if before is None else stored_config(ledger)
         train, test = Blueprint.of(stored).instances()
+        learned = None if stored.init_from is None else ledger.read(ledger.initial_weights)
     except LedgerError as error:
         raise ConfigError(
             f"{ledger.folder} holds a run of another configuration; which cannot be told: {error}"
         ) from error
-    if identity == configs.identity(stored, train.digest(), test.digest()):
-        return
+    digests = train.digest(), test.digest()
+    if identity == configs.identity(stored, *digests, weights=learned):
+        return None
+    longer = stored.model_copy(update={"budget": config.budget})
+    if identity == configs.identity(longer, *digests, weights=learned) and is_longer(stored, config):
+        return stored
     changes = configs.differences(stored, config)
+    if learned != weights:
+        changes.append("init_from: other networks")
     if (train.digest(), test.digest()) != (setup.train.digest(), setup.test.digest()):
         changes.append("instances: other contexts or ids")
     raise ConfigError(
@@ -295,6 +315,7 @@ def _self_contained(config: RunConfig) -> RunConfig:
         update={
             "instances": config.instances.model_copy(update=instances),
             "tracking": config.tracking.model_copy(update={"uri": absolute_uri(config.tracking.uri)}),
+            "init_from": None if config.init_from is None else Path("init.npz"),
         }
     )
 
@@ -334,7 +355,8 @@ def _cluster(active: ActiveRun, waiting: Callable[[str], None]) -> Iterator[Clus
         private_ray()
     else:
         waiting(f"waiting for room for {actors} on the Ray at {config.resources.address}")
-    from space_dist.run.ray_cluster import RayCluster  # Ray takes a second to import and is not needed without workers
+    with needed_from("ray", f"resources.workers: {workers}", "use resources.workers=0"):
+        from space_dist.run.ray_cluster import RayCluster  # it takes a second, and is not needed without workers
 
     with contextlib.ExitStack() as stack:
         with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler

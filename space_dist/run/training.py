@@ -54,6 +54,7 @@ from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
+from space_dist.run.starting import start_from
 from space_dist.run.state import RunState
 
 log = logging.getLogger("space_dist")
@@ -192,7 +193,10 @@ class Training:
 
     def _begin(self) -> Work[Handle]:
         cluster = self._cluster
-        if self.learner.normalises:
+        if self._config.init_from is not None:
+            ledger = self._writer.ledger
+            start_from(self.learner, ledger.read(ledger.initial_weights))
+        elif self.learner.normalises:
             yield from self._measure_scales()
         policy = cluster.put(self.learner.policy(0))
         first = cluster.begin(cluster.start_values(policy))
@@ -413,7 +417,13 @@ class Training:
         yield from self._commit("done")
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
-        self._writer.write_model(arrays, {**description, "context_visible": self._config.env.context_visible})
+        bounds = self._setup.spec.context_bounds
+        description["context_visible"] = self._config.env.context_visible
+        description["context"] = {
+            "names": list(bounds.names), "low": bounds.low.tolist(), "high": bounds.high.tolist(),
+            "formula": "2 * (context - low) / (high - low) - 1, clipped to [-1, 1]; at the end of an observation",
+        }  # fmt: skip
+        self._writer.write_model(arrays, description)
         self._writer.set_status(self._new_status("done"))
 
     # ---- waiting, and the ledger ----

@@ -262,7 +262,7 @@ def load_profile(path: Path | None, overrides: Sequence[str] = ()) -> Profile:
 
     Raises ConfigError with file and key of every fault.
     """
-    data: dict[str, Any] = {} if path is None else configs.read_yaml(path)
+    data: dict[str, Any] = {} if path is None else configs.read_yaml(configs.located(path))
     for override in overrides:
         configs.apply_override(data, override)
     origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}

@@ -16,6 +16,8 @@ from typing import Any, Final
 import requests
 from requests.utils import super_len
 
+from space_dist.system.extras import needed_from
+
 SECONDS: Final = 20.0  # for a request and its answer, retries and redirections included
 _BYTES_A_SECOND: Final = 100_000  # of what is sent, for which there is more time
 MAX_BYTES: Final = 64 << 20  # of an answer; the largest that we ask for are pages of 200 runs
@@ -25,7 +27,8 @@ _UNTIL: Final = "space_dist until"  # a key of a request's hooks, of which reque
 
 def bound_answers() -> None:
     """Have MLflow's requests bounded in this process. To be called before the first one; again changes nothing."""
-    from mlflow.utils import request_utils
+    with needed_from("mlflow", "the mirror in MLflow", "use tracking.uri=null"):
+        from mlflow.utils import request_utils
 
     if getattr(request_utils.TCPKeepAliveHTTPAdapter, "bounded", False):
         return

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final
 from space_dist.config.tracking_uri import UriError, checked_uri
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
 from space_dist.ledger import METRICS, Ledger
+from space_dist.system.extras import needed_from
 from space_dist.system.files import in_words, locked
 from space_dist.system.importing import PYTHON
 from space_dist.system.workplace import absolute_uri
@@ -362,7 +363,8 @@ def _database(uri: str) -> Path:
 
 
 def _new_client(uri: str) -> MlflowClient:
-    from mlflow import MlflowClient
+    with needed_from("mlflow", "the mirror in MLflow", "use tracking.uri=null"):
+        from mlflow import MlflowClient
 
     for name in ("mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)

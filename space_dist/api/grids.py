@@ -1,0 +1,129 @@
+"""Work through a grid from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from space_dist.api.progress import line_of_grid, shown
+from space_dist.api.reports import ReportView, report_on
+from space_dist.api.training import Run
+from space_dist.experiment import manifest as manifests
+from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
+from space_dist.experiment.status import RunStatus, run_statuses
+from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
+from space_dist.grid.warm import LocalExecutor, local_is_enough
+from space_dist.system.extras import needed_from
+from space_dist.system.importing import look_here_too
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.provenance import code_digest
+from space_dist.system.workplace import lasting, private_ray, workplace
+
+if TYPE_CHECKING:
+    from space_dist.grid.jobs import Mode
+
+
+class GridRun:
+    """A grid's folder, read from Python: `GridRun("runs/quickstart")`, or what `run_grid` returns.
+
+    Raises LedgerError where there is no grid.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.grid = Grid(folder)
+        self.manifest = self.grid.manifest()
+
+    def __repr__(self) -> str:
+        found = self.statuses
+        done = sum(one.condition == "done" for one in found)
+        return f"GridRun({str(self.folder)!r}: {self.manifest.name}, {done} of {len(found)} runs done)"
+
+    @property
+    def folder(self) -> Path:
+        """The grid's folder."""
+        return self.grid.folder
+
+    @property
+    def statuses(self) -> list[RunStatus]:
+        """Where every run stands now: `condition` (done, running, waiting, failed), `cause`, `detail`, ..."""
+        return run_statuses(self.grid, self.manifest, code_digest())
+
+    @property
+    def complete(self) -> bool:
+        """Whether all runs are done."""
+        return all(one.condition == "done" for one in self.statuses)
+
+    def runs(self) -> dict[tuple[str, int], Run]:
+        """Those that have begun, by (label of the cell, seed)."""
+        ledgers = {(run.cell.label, run.seed): self.grid.ledger(run) for run in self.manifest.runs()}
+        return {key: Run(ledger.folder) for key, ledger in ledgers.items() if ledger.status_file.exists()}
+
+    def report(self, **how: Any) -> ReportView:
+        """Tables with intervals, and figures: see `report_on`, whose keywords this takes."""
+        return report_on(self.folder, **how)
+
+
+def run_grid(
+    grid: Path | str | Grid | GridRun,
+    *,
+    root: Path | str | None = None,
+    max_parallel: int | None = None,
+    progress: bool | Callable[[Overview], None] = True,
+) -> GridRun:
+    """Work through a grid on this machine, as `space-dist grid run` does: what is done is skipped.
+
+    grid: its YAML file, `shipped:NAME`, its folder, or its manifest.json.  root: the folder that holds grids' folders;
+    None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  progress: show a line that
+    changes in its place; or what is called now and then.
+
+    Runs that fail are noted (`GridRun.statuses`) and raise nothing. Raises ConfigError for every fault of the files,
+    LedgerError if the folder cannot be written.
+    """
+    look_here_too()
+    base = workplace() / "runs" if root is None else lasting(Path(root), "root")
+    named = grid.folder if isinstance(grid, Grid | GridRun) else Path(grid)
+    place, manifest = frozen(named, base)
+    stop = StopRequests()
+    with shown(progress is True) as show:
+
+        def observe(overview: Overview) -> None:
+            if callable(progress):
+                progress(overview)
+            show(line_of_grid(manifest.name, overview))
+
+        with working_on(place, manifest, wait=True, stop_requested=stop.reason, say=show):
+            worked_through(place, manifest, manifest.runs(), max_parallel=max_parallel, stop=stop, observe=observe)
+    return GridRun(place.folder)
+
+
+def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
+    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
+    if path.is_dir() or path.name == MANIFEST:
+        source = find_grid(path, root)
+        place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
+        return place, place.manifest()
+    from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
+
+    made = plan(path, root)
+    return made.grid, made.manifest
+
+
+def worked_through(
+    place: Grid, manifest: Manifest, runs: Sequence[manifests.Run], *, stop: StopRequests,
+    observe: Callable[[Overview], None], address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
+    nodes: int = 1, reinstall: Callable[[], None] = lambda: None,
+) -> list[RunStatus]:  # fmt: skip
+    """Work through runs of a frozen grid; returns where they stand in the end. Arguments: as of `grid.jobs.conduct`."""
+    if address == "local" and local_is_enough(manifest, runs, max_parallel):
+        with LocalExecutor(place, manifest, stop.reason) as here:
+            return Conductor(place, manifest, runs, here, stop_requested=stop.reason, observe=observe).conduct()
+    if address == "local":
+        private_ray()
+    with needed_from("ray", "a grid whose runs go side by side", "do them one after another: --max-parallel 1"):
+        from space_dist.grid.jobs import conduct
+
+    return conduct(
+        place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
+        stop_requested=stop.reason, reinstall=reinstall, observe=observe,
+    )  # fmt: skip

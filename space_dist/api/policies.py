@@ -1,0 +1,111 @@
+"""A run's policy, to act with: NumPy in, NumPy out, with the method that Stable-Baselines3's policies have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from space_dist.envs import Observations
+from space_dist.envs.observations import rows
+from space_dist.envs.spec import EnvironmentSpec
+from space_dist.errors import ConfigError
+from space_dist.ledger import Ledger
+from space_dist.rollout.policy import Noise, Policy, policies_of
+from space_dist.run.building import spec_of
+from space_dist.run.launch import policy_of, stored_config
+
+if TYPE_CHECKING:
+    from space_dist.api.training import Run
+
+
+class ActingPolicy:
+    """One policy of a run.
+
+    policy: its networks (`values` says what states are worth).  spec: of its environment: spaces, horizon, and the
+    bounds of contexts.
+    """
+
+    def __init__(self, policy: Policy, spec: EnvironmentSpec, *, seed: int = 0) -> None:
+        self.policy, self.spec = policy, spec
+        self._random = np.random.default_rng(seed)
+
+    def predict(
+        self,
+        observation: Observations,
+        state: None = None,  # noqa: ARG002 - those who take any of SB3's policies pass it, and the next one
+        episode_start: object = None,  # noqa: ARG002
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], None]:
+        """`(..., obs) -> (..., action)` what to do, and None, as Stable-Baselines3's `predict` has it.
+
+        observation: one, or a batch of them; with the scaled context where the run shows it: see `with_context`.
+        deterministic: the likeliest or best action; else one drawn as in training. A policy has no `state`. Raises
+        ConfigError for another shape.
+        """
+        batch, single = self._batched(observation)
+        head, outputs = self.policy.head, self.policy.outputs(batch)
+        if deterministic:
+            actions = head.best(outputs)
+        else:
+            noise = Noise.draw(head, self.spec.action_space, self._random, (1, rows(batch)))
+            actions = head.sampled(outputs, noise, 0, np.full(rows(batch), np.iinfo(np.int64).max))
+        executed = head.executed(actions)
+        return (executed[0] if single else executed), None
+
+    def with_context(self, observation: Observations, context: NDArray[Any]) -> Observations:
+        """`(..., obs), (..., d)` observations as the run's policy saw them: with the context, if it is shown one.
+
+        context: in environment units; it is scaled from its bounds to [-1, 1], and put behind flat observations, or
+        beside the parts of others. Raises ConfigError for a context of another length.
+        """
+        if not self.spec.context_visible:
+            return observation
+        bounds = self.spec.context_bounds
+        scaled = np.clip(bounds.scale(np.asarray(context, dtype=np.float64)), -1.0, 1.0).astype(np.float32)
+        if isinstance(self.spec.observation_space, spaces.Dict):
+            parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
+            return {**parts, "context": scaled}
+        plain = np.asarray(observation, dtype=np.float32)
+        return np.concatenate([plain, np.broadcast_to(scaled, (*plain.shape[:-1], scaled.shape[-1]))], axis=-1)
+
+    def _batched(self, observation: Observations) -> tuple[Observations, bool]:
+        """The observations as a batch, and whether there is one alone."""
+        space = self.spec.observation_space
+        if isinstance(observation, dict):
+            parts: dict[str, Any] = dict(getattr(space, "spaces", {}))
+            if set(parts) != set(observation):
+                raise ConfigError(f"an observation has the parts {', '.join(parts) or 'none'}, not {[*observation]}")
+            found = {name: _batch(np.asarray(observation[name]), parts[name].shape, name) for name in parts}
+            return {name: batch for name, (batch, _) in found.items()}, all(one for _, one in found.values())
+        return _batch(np.asarray(observation), space.shape or (), "")
+
+
+def _batch(array: NDArray[Any], shape: tuple[int, ...], name: str) -> tuple[NDArray[Any], bool]:
+    if array.shape == shape:
+        return array[None], True
+    if array.shape[1:] != shape:
+        part = f" {name!r}" if name else ""
+        raise ConfigError(
+            f"an observation{part} has the shape {shape}, or (n, {', '.join(map(str, shape))}), not {array.shape}; "
+            "where the run shows the context, `with_context` puts it there"
+        )
+    return array, False
+
+
+def load_policy(run: Run | Path | str, *, number: int = 0, seed: int = 0) -> ActingPolicy:
+    """What a run has learned: its final model, or, of an unfinished one, the policy of its last checkpoint.
+
+    run: its folder.  number: which, where a run trains several.  seed: of the actions that are drawn.
+    Raises LedgerError where there is no policy yet, and ConfigError if the environment cannot be made.
+    """
+    ledger = Ledger(run if isinstance(run, str | Path) else run.folder)
+    ledger.status()
+    spec = spec_of(stored_config(ledger))
+    policies = policies_of(policy_of(ledger, spec))
+    if not 0 <= number < len(policies):
+        raise ConfigError(f"{ledger.folder} has {len(policies)} policies, counted from 0; it has no number {number}")
+    return ActingPolicy(policies[number], spec, seed=seed)

@@ -1,0 +1,181 @@
+"""Train a run from Python, and read what one left."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from space_dist import config as configs
+from space_dist.api.policies import ActingPolicy, load_policy
+from space_dist.api.progress import line_of_run, shown
+from space_dist.config import RunConfig
+from space_dist.errors import ConfigError, about
+from space_dist.ledger import METRICS, Ledger, Row, Status
+from space_dist.report import draw_learning_curve, load_run
+from space_dist.report.figures import png
+from space_dist.run.launch import launch, stored_config
+from space_dist.run.training import Progress
+from space_dist.system.importing import look_here_too
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.workplace import default_folder, lasting
+
+Config = str | Path | Mapping[str, Any] | RunConfig
+Overrides = Mapping[str, Any] | Sequence[str]
+
+_SOURCE: Final = "config"  # what a config is called in sentences that lies in no file
+
+
+class Run:
+    """A run's folder, read from Python: `Run("runs/pointmass_space/s0")`, or what `train` returns.
+
+    tracking_warning: what MLflow's mirror lacks, as `train` found it. Raises LedgerError where there is no run.
+    """
+
+    def __init__(self, folder: Path | str, *, tracking_warning: str | None = None) -> None:
+        self.ledger = Ledger(folder)
+        self.tracking_warning = tracking_warning
+        self.ledger.status()
+
+    def __repr__(self) -> str:
+        status = self.status
+        return (
+            f"Run({str(self.folder)!r}: {status.name}, seed {status.seed}, {status.state}, "
+            f"{status.steps:,}/{status.budget_steps:,} steps)"
+        )
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return self.ledger.folder
+
+    @property
+    def status(self) -> Status:
+        """Where it stands now: `state`, `steps`, `budget_steps`, `message`, ..."""
+        return self.ledger.status()
+
+    @functools.cached_property
+    def config(self) -> RunConfig:
+        """What was asked for, every default written out. Raises LedgerError if it is not what the run wrote."""
+        return stored_config(self.ledger)
+
+    def rows(self, file: str = METRICS) -> list[Row]:
+        """The rows of `metrics.jsonl` (an iteration or an evaluation each), or of another file of rows."""
+        return self.ledger.rows(file)
+
+    @property
+    def evaluations(self) -> list[Row]:
+        """The rows of evaluations: `steps`, and of `train` and `test` the mean `return`, `success`, `length`, ..."""
+        return [row for row in self.rows() if row["kind"] == "evaluation"]
+
+    @property
+    def final(self) -> dict[str, float]:
+        """The mean returns of the policy that the run finished with: `train` and `test`, undiscounted.
+
+        Raises ConfigError for a run that is not finished.
+        """
+        found, status = self.evaluations, self.status
+        if not found or not status.is_final(found[-1]["steps"]):
+            raise ConfigError(f"{self.folder} is not finished ({status.state}): `evaluations` has what there is")
+        return {split: float(found[-1][split]["return"]) for split in ("train", "test")}
+
+    def policy(self, *, seed: int = 0) -> ActingPolicy:
+        """What it learned: see `load_policy`."""
+        return load_policy(self, seed=seed)
+
+    def _repr_png_(self) -> bytes | None:
+        """Its learning curve, as notebooks show it; nothing before the first evaluation."""
+        found = load_run(self.ledger)
+        return png(draw_learning_curve(found)) if len(found.evaluation_steps) else None
+
+
+def train(
+    config: Config,
+    *,
+    seed: int | None = None,
+    workers: int | None = None,
+    out: Path | str | None = None,
+    resume: bool = False,
+    overrides: Overrides = (),
+    progress: bool | Callable[[Progress], None] = True,
+) -> Run:
+    """Train one policy under one curriculum, to its end, as `space-dist train` does; the bits are the same.
+
+    config: a YAML file's path, `shipped:NAME`, the same keys as a nested mapping (relative paths are then relative to
+        the current folder), or a `RunConfig`.
+    overrides: key -> value (`{"budget.steps": 20_000}`), or as the command's `--set` has it (`["budget.steps=20000"]`).
+    seed, workers: the run's seed, and its Ray actors (0: everything in this process, without Ray).
+    out: the run's folder; None: `runs/<name>/s<seed>` here.  resume: go on with the run that is there, if any.
+    progress: show a line that changes in its place, in a notebook or on a terminal; or what is called after each round.
+
+    Raises ConfigError with the key of every fault, or if the folder holds another run; Interrupted if a file `stop` in
+    the run's folder asked for that; SpaceDistError if it failed. After KeyboardInterrupt, `resume=True` goes on from
+    the last checkpoint.
+    """
+    look_here_too()
+    run = as_config(config, overrides, seed=seed, workers=workers)
+    folder = default_folder(run.name, run.seed) if out is None else lasting(Path(out), "out")
+    source = str(config) if isinstance(config, str | Path) else _SOURCE
+    with about(source), shown(progress is True) as show:
+
+        def observe(now: Progress) -> None:
+            if callable(progress):
+                progress(now)
+            show(line_of_run(run.name, run.seed, now))
+
+        def waiting(what: str) -> None:
+            show(f"{run.name} s{run.seed}  {what}")
+
+        outcome = launch(run, folder, resume=resume, stop=StopRequests(), observe=observe, waiting=waiting)
+    return Run(outcome.ledger.folder, tracking_warning=outcome.tracking_warning)
+
+
+def as_config(
+    config: Config, overrides: Overrides = (), *, seed: int | None = None, workers: int | None = None
+) -> RunConfig:
+    """A checked config from whatever names or holds one. Raises ConfigError with the key of every fault."""
+    if isinstance(config, str | Path):
+        data, source = configs.read(Path(config)), str(config)
+    elif isinstance(config, RunConfig):
+        data, source = config.model_dump(mode="json"), _SOURCE
+    elif isinstance(config, Mapping):
+        data, source = configs.plain(_without_numpy(config), _SOURCE), _SOURCE
+        configs.from_its_folder(data, Path.cwd())
+    else:
+        raise ConfigError(f"a config is a path, a mapping or a RunConfig, not a {type(config).__name__}")
+    origins: dict[str, str] = {}
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides must be a mapping or a list, like {{'budget.steps': 20000}}, not {overrides!r}")
+    if isinstance(overrides, Mapping):
+        for key, value in configs.plain(_without_numpy(overrides), "overrides").items():
+            origins[key] = f"overrides[{key!r}]"
+            configs.put(data, key, _from_here(key, value), origins[key])
+    else:
+        for override in overrides:
+            configs.apply_override(data, override)
+            origins[override.partition("=")[0].strip()] = f"--set {override}"
+    for key, given in (("seed", seed), ("resources.workers", workers)):
+        if given is not None:
+            configs.put(data, key, _without_numpy(given), source)
+            origins[key] = key.rpartition(".")[2]
+    return configs.parse(data, source, origins)
+
+
+def _from_here(key: str, value: Any) -> Any:
+    if key.partition(".")[0] not in ("instances", "init_from"):
+        return value
+    return configs.from_folder(value, Path.cwd()) if isinstance(value, dict) else configs.beside(value, Path.cwd())
+
+
+def _without_numpy(value: Any) -> Any:
+    """What Python programs write, in the words of YAML: lists for tuples and arrays, text for paths."""
+    if isinstance(value, Mapping):
+        return {key: _without_numpy(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _without_numpy(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_without_numpy(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,70 @@
+"""Commands to start with: what ships, and a project of one's own that runs as it is written."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from space_dist.cli.terminal import delivered, say, write
+from space_dist.errors import ConfigError
+
+_PROJECT = Path(__file__).with_name("project")
+_DISGUISE = ".in"  # of files that would be taken for this package's own
+
+
+def configs(
+    copy: Annotated[
+        Optional[tuple[str, Path]],  # noqa: UP045 - typer reads annotations at run time
+        typer.Option("--copy", metavar="NAME DIR", help="Copy one, and the files it names, into a folder."),
+    ] = None,
+) -> None:
+    """List the configs, grids and profiles that ship: a path like shipped:pointmass_space names one anywhere."""
+    from space_dist.config import about_shipped, shipped_files
+
+    if copy is not None:
+        _copy(*copy)
+        return
+    files = [file for file in shipped_files() if file.endswith(".yaml")]
+    width = max(map(len, files)) - len(".yaml")
+    for file in sorted(files, key=lambda file: ("/" in file, file)):
+        say(f"shipped:{file.removesuffix('.yaml'):{width}}  {about_shipped(file)}")
+    delivered()
+
+
+def _copy(name: str, out: Path) -> None:
+    from space_dist.config import located, shipped_files, with_what_it_names
+    from space_dist.config.shipped import FOLDER, PREFIX
+
+    chosen = located(PREFIX + name.removeprefix(PREFIX))
+    (file,) = (file for file in shipped_files() if FOLDER / file == chosen)
+    files = with_what_it_names(file)
+    _refuse_what_is_there([out / one for one in files])
+    for one in files:
+        write(out / one, (FOLDER / one).read_text())
+        say(str(out / one))
+
+
+def _refuse_what_is_there(paths: list[Path]) -> None:
+    for path in paths:
+        if path.exists():
+            raise ConfigError(f"{path} exists; choose another folder, or remove it")
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that is empty, or not there yet.")],
+) -> None:
+    """Write a project that runs as it is: environment, instances, config, grid, SLURM profile."""
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ConfigError(f"{folder} is not empty; a project is written into a folder of its own")
+        for source in sorted(path for path in _PROJECT.rglob("*") if path.is_file()):
+            target = folder / str(source.relative_to(_PROJECT)).removesuffix(_DISGUISE)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+            say(str(target))
+    except OSError as error:
+        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+    say(f"Next: cd {folder} && space-dist train slider.yaml   (README.md says what else)")

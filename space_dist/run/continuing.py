@@ -1,0 +1,54 @@
+"""Going on with a run under a larger budget, to the bytes of one that had that budget from the start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from space_dist.config import DQNConfig, RunConfig
+from space_dist.errors import ConfigError
+from space_dist.ledger import Checkpoint
+
+
+def is_longer(before: RunConfig, now: RunConfig) -> bool:
+    """Whether `now` is `before` with a larger budget, in steps or episodes, and no smaller one.
+
+    Raises ConfigError if it is, and what was done until now would have come out otherwise under that budget.
+    """
+    old, new = before.budget, now.budget
+    if old == new or new.steps < old.steps:
+        return False
+    if new.episodes is not None and (old.episodes is None or new.episodes < old.episodes):
+        return False
+    reason = _goes_by_budget(before)
+    if reason is not None:
+        raise ConfigError(
+            f"budget: {old.steps:,} -> {new.steps:,} steps: {reason}, so a longer run is another from its start: "
+            "use --out DIR for it. With `init_from` it starts from this run's policy"
+        )
+    return True
+
+
+def _goes_by_budget(config: RunConfig) -> str | None:
+    """What of a config has a run do other things under another budget, as a clause; None: nothing."""
+    learner = config.learner
+    if learner.learning_rate_schedule != "constant":
+        return f"learner.learning_rate_schedule: {learner.learning_rate_schedule} falls to 0 at the end of the budget"
+    if isinstance(learner, DQNConfig):
+        return f"learner.exploration_fraction: {learner.exploration_fraction:g} is a share of the budget"
+    if learner.import_path is not None:
+        return f"learner.import: {learner.import_path} may go by how much of the budget is left"
+    if config.curriculum.may_probe:
+        return f"curriculum.kind: {config.curriculum.kind} probes as long as the budget has room for it"
+    return None
+
+
+def within(config: RunConfig, horizon: int) -> Callable[[Checkpoint], bool]:
+    """Whether a checkpoint was made before the end of `config`'s budget: a longer run has passed through it as well."""
+    budget, longest = config.budget, config.round_steps(horizon)
+
+    def was_before_the_end(checkpoint: Checkpoint) -> bool:
+        run = checkpoint.data["run"]
+        enough = budget.episodes is not None and run["episodes"] >= budget.episodes
+        return not enough and run["steps"] + longest <= budget.steps
+
+    return was_before_the_end

@@ -1,0 +1,291 @@
+"""The Python API: the page that describes it, what it does as the command does, and how it refuses."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import space_dist
+from space_dist import config as configs
+from space_dist.api import progress
+from space_dist.api.training import as_config
+from space_dist.config import RunConfig
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.grid.planning import plan
+from space_dist.ledger import CURRICULUM, METRICS
+from space_dist.run.training import Progress
+from tests.commanding import command
+from tests.patience import PATIENCE
+from tests.test_learners import N_STEPS, config_for, learner_section
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs/python.md"
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+RESULTS = (METRICS, CURRICULUM, "values.jsonl", "model.npz", "model.json")
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+def test_every_block_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    said, names = io.StringIO(), {"__name__": "page"}
+    with contextlib.redirect_stdout(said):
+        for block in BLOCK.findall(PAGE.read_text()):
+            exec(compile(block, str(PAGE), "exec"), names)  # noqa: S102 - our own page
+    told = said.getvalue()
+    assert "did you mean 'kappa'?" in told
+    assert "4,096/4,096 steps" in told
+    grid: Any = names["grid"]
+    assert grid.complete
+    assert len(grid.runs()) == 4
+    html = names["report"]._repr_html_()  # type: ignore[attr-defined]
+    assert html.count("<img") == len(names["report"].figures) >= 1  # type: ignore[attr-defined]
+    assert names["run"]._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+
+
+# ---- a larger budget, and starting from another run ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "changes"), [
+    ("ppo", {}), ("sac", {}), ("ppo", {"normalize_observations": True, "normalize_rewards": True}),
+])  # fmt: skip
+def test_a_longer_run_is_the_one_that_had_its_budget_from_the_start(
+    kind: str, changes: dict[str, Any], tmp_path: Path
+) -> None:
+    section = learner_section(kind, **changes)
+    short = config_for(tmp_path, section, checkpoint={"every_rounds": 2})
+    long = config_for(tmp_path, section, checkpoint={"every_rounds": 2}, budget={"steps": 11 * N_STEPS})
+    space_dist.train(short, out=tmp_path / "run", progress=False)
+    assert space_dist.Run(tmp_path / "run").status.steps == short.budget.steps
+    with pytest.raises(ConfigError, match="--resume continues it"):
+        space_dist.train(long, out=tmp_path / "run", progress=False)
+    space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    space_dist.train(long, out=tmp_path / "whole", progress=False)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+    with pytest.raises(ConfigError, match=r"another configuration \(budget.steps: 440 -> 240\)"):
+        space_dist.train(short, out=tmp_path / "run", resume=True, progress=False)
+
+
+def test_a_run_shorter_than_its_first_checkpoint_begins_anew(tmp_path: Path) -> None:
+    section, seldom = learner_section("ppo"), {"every_rounds": 1000, "every_seconds": 1e6}
+    space_dist.train(config_for(tmp_path, section, checkpoint=seldom), out=tmp_path / "run", progress=False)
+    long = config_for(tmp_path, section, checkpoint=seldom, budget={"steps": 8 * N_STEPS})
+    space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    space_dist.train(long, out=tmp_path / "whole", progress=False)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+def test_a_longer_run_that_is_interrupted_goes_on(tmp_path: Path) -> None:
+    section = learner_section("ppo")
+    space_dist.train(config_for(tmp_path, section), out=tmp_path / "run", progress=False)
+    long = config_for(tmp_path, section, budget={"steps": 12 * N_STEPS})
+
+    def give_up(now: Progress) -> None:
+        if now.steps >= 8 * N_STEPS:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        space_dist.train(long, out=tmp_path / "run", resume=True, progress=give_up)
+    assert space_dist.Run(tmp_path / "run").status.state == "interrupted"
+    space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    space_dist.train(long, out=tmp_path / "whole", progress=False)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("kind", "changes", "reason"), [
+    ("ppo", {"learning_rate_schedule": "linear"}, "learner.learning_rate_schedule: linear falls to 0"),
+    ("dqn", {}, "learner.exploration_fraction: 0.5 is a share of the budget"),
+])  # fmt: skip
+def test_what_goes_by_the_budget_is_not_made_longer(
+    kind: str, changes: dict[str, Any], reason: str, tmp_path: Path
+) -> None:
+    section = learner_section(kind, **changes)
+    space_dist.train(config_for(tmp_path, section), out=tmp_path / "run", progress=False)
+    before = files(tmp_path / "run")
+    with pytest.raises(ConfigError, match=reason):
+        space_dist.train(
+            config_for(tmp_path, section, budget={"steps": 8 * N_STEPS}), out=tmp_path / "run", resume=True
+        )
+    assert files(tmp_path / "run") == before
+
+
+@pytest.mark.parametrize("kind", ["ppo", "td3"])
+def test_a_run_starts_from_what_another_has_learned(kind: str, tmp_path: Path) -> None:
+    section = learner_section(kind, normalize_observations=True)
+    first = space_dist.train(config_for(tmp_path, section), out=tmp_path / "first", progress=False)
+    from_it = config_for(tmp_path, section, init_from=str(tmp_path / "first"))
+    second = space_dist.train(from_it, out=tmp_path / "second", progress=False)
+    assert second.evaluations[0]["test"]["returns"] == first.evaluations[-1]["test"]["returns"]
+    assert second.evaluations[0]["steps"] == 0
+    # The copy is the run's own, and stands for what it was made of.
+    kept = config_for(tmp_path, section, init_from=str(tmp_path / "second/init.npz"))
+    space_dist.train(kept, out=tmp_path / "second", resume=True, progress=False)
+    fresh = config_for(tmp_path, section)
+    with pytest.raises(ConfigError, match="init_from: other networks"):
+        space_dist.train(fresh, out=tmp_path / "second", resume=True, progress=False)
+
+
+@pytest.mark.parametrize("engine", ["single", "population"])
+def test_a_grid_keeps_what_its_runs_start_from(engine: str, tmp_path: Path) -> None:
+    config = config_for(tmp_path, learner_section("ppo"))
+    first = space_dist.train(config, out=tmp_path / "first", progress=False)
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
+    (tmp_path / "grid.yaml").write_text(
+        f"name: from_first\nextends: run.yaml\nset: {{ init_from: first, engine: {engine} }}\nseeds: [0]\n"
+        "tracking: { uri: null }\n"
+    )
+    plan(tmp_path / "grid.yaml", tmp_path / "runs")
+    learned = first.evaluations[-1]["test"]["returns"]
+    shutil.rmtree(first.folder)
+    grid = space_dist.run_grid(tmp_path / "runs/from_first", max_parallel=1, progress=False)
+    assert grid.complete, grid.statuses
+    for run in grid.runs().values():
+        np.testing.assert_allclose(run.evaluations[0]["test"]["returns"], learned, rtol=1e-6)
+    assert grid.report().numbers[0]["runs"] == 1
+
+
+def test_networks_that_do_not_fit_are_refused_with_what_differs(tmp_path: Path) -> None:
+    space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "first", progress=False)
+    for section, reason in (
+        (learner_section("ppo", net_arch=[8]), r"has the shape \(16, 2\) in that run, and \(8, 2\) here"),
+        (learner_section("sac"), "that run has no 'policy/actor"),
+        (learner_section("ppo", normalize_rewards=True), "that run has no 'normaliser/"),
+    ):
+        with pytest.raises(ConfigError, match=f"init_from: .*{reason}"):
+            space_dist.train(
+                config_for(tmp_path, section, init_from=str(tmp_path / "first")), out=tmp_path / "no", progress=False
+            )
+    for path, reason in ((tmp_path / "nowhere", "does not exist"), (tmp_path / "train.csv", "holds no weights"),
+                         (tmp_path, "holds no run")):  # fmt: skip
+        with pytest.raises(ConfigError, match=f"init_from: .*{reason}"):
+            space_dist.train(config_for(tmp_path, learner_section("ppo"), init_from=str(path)), out=tmp_path / "no")
+    assert not (tmp_path / "no").exists()
+
+
+# ---- configs, policies, folders --------------------------------------------------------------------------------------
+
+
+def test_a_config_is_a_path_a_mapping_or_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = ROOT / "configs/pointmass_space.yaml"
+    read = as_config(path, {"budget.steps": np.int64(4096), "learner.net_arch": (8, 8)}, seed=3, workers=0)
+    assert (read.seed, read.budget.steps, read.resources.workers, read.learner.net_arch) == (3, 4096, 0, (8, 8))
+    assert as_config(str(path), ["budget.steps=4096", "learner.net_arch=[8, 8]"], seed=3, workers=0) == read
+    assert as_config(read) == read
+    data = read.model_dump(mode="json")
+    data["instances"] = {"train": "here.csv", "test": Path("there.csv")}
+    assert as_config(data).instances.train == tmp_path / "here.csv"
+    assert data["instances"]["train"] == "here.csv"
+    for bad, words in (
+        (7, "a path, a mapping or a RunConfig, not a int"),
+        ({**data, "nmae": "x"}, "config: nmae: unknown key; did you mean 'name'?"),
+        ({**data, "learner": {"kind": "ppo", "n_steps": object()}}, "learner.n_steps"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(words)):
+            as_config(bad)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="overrides must be a mapping or a list"):
+        as_config(read, "budget.steps=3")
+
+
+def test_train_does_what_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = config_for(tmp_path, learner_section("ppo"))
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
+    assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", tmp_path / "told") == 0
+    run = space_dist.train(tmp_path / "run.yaml", out=tmp_path / "called")
+    assert files(tmp_path / "told") == files(run.folder)
+    assert run.final["test"] == run.evaluations[-1]["test"]["return"]
+    assert isinstance(run.config, RunConfig)
+    with pytest.raises(LedgerError, match="holds no run"):
+        space_dist.Run(tmp_path / "nowhere")
+
+
+def test_a_policy_acts_as_the_run_does(tmp_path: Path) -> None:
+    run = space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "run", progress=False)
+    policy = run.policy(seed=3)
+    plain = np.linspace(-1.0, 1.0, 5)[:, None]
+    seen = policy.with_context(plain, np.array([0.5]))
+    assert isinstance(seen, np.ndarray)
+    assert seen.tolist() == [[x, 0.5] for x in plain[:, 0].astype(np.float32).tolist()]
+    batch, state = policy.predict(seen)
+    assert (batch.shape, state) == ((5, 1), None)
+    one, _ = policy.predict(seen[2])
+    assert one.tolist() == batch[2].tolist()
+    drawn, _ = policy.predict(seen, deterministic=False)
+    assert drawn.tolist() != batch.tolist()
+    assert drawn.tolist() == run.policy(seed=3).predict(seen, deterministic=False)[0].tolist()
+    with pytest.raises(ConfigError, match=r"has the shape \(2,\), or \(n, 2\), not \(3,\)"):
+        policy.predict(np.zeros(3))
+    with pytest.raises(ConfigError, match="contexts of shape"):
+        policy.with_context(plain, np.zeros(4))
+    with pytest.raises(ConfigError, match="it has no number 1"):
+        space_dist.load_policy(run, number=1)
+
+
+def test_the_model_tells_how_contexts_are_scaled(tmp_path: Path) -> None:
+    run = space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "run", progress=False)
+    told = json.loads((run.folder / "model.json").read_text())["context"]
+    assert (told["names"], told["low"], told["high"]) == (["target"], [-1.0], [1.0])
+
+
+# ---- what is shown, and what importing costs -------------------------------------------------------------------------
+
+
+def test_a_notebook_shows_one_line_in_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+
+    class Handle:
+        def update(self, page: dict[str, str], raw: bool) -> None:
+            assert raw
+            shown.append(page["text/plain"])
+
+    def display(page: dict[str, str], raw: bool, display_id: bool) -> Handle:
+        assert page["text/plain"] == ""
+        assert raw
+        assert display_id
+        return Handle()
+
+    fake, inside = types.ModuleType("IPython"), types.ModuleType("IPython.display")
+    fake.get_ipython = lambda: types.SimpleNamespace(kernel=object())  # type: ignore[attr-defined]
+    inside.display = display  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "IPython", fake)
+    monkeypatch.setitem(sys.modules, "IPython.display", inside)
+    monkeypatch.setattr(progress, "_SECONDS", 0.0)
+    space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "run")
+    assert len(shown) >= 6
+    assert shown[-1].startswith("tiny s0  240/240 steps (100%)")
+    shown.clear()
+    space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "other", progress=False)
+    assert shown == []
+
+
+def test_names_are_there_and_nothing_is_imported_before_one_is_asked_for() -> None:
+    assert set(space_dist.__all__) <= set(dir(space_dist))
+    for name in space_dist.__all__:
+        assert getattr(space_dist, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        space_dist.trian  # noqa: B018
+    code = (
+        "import sys; before = set(sys.modules); import space_dist; "
+        "new = {name.partition('.')[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names); "
+        "print(sorted(name for name in new if not name.startswith('_')))"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=PATIENCE, env=environment
+    )  # fmt: skip
+    assert done.stdout.strip() == "['space_dist']", done.stderr
