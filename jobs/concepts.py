@@ -119,7 +119,9 @@ def selections(run: Path) -> Figure:
         chosen = np.array([contexts[one] for one in decision["trained"]])
         axes.scatter(*np.array(list(contexts.values())).T, s=14, facecolor="white", edgecolor=QUIET, lw=0.9)
         axes.scatter(*chosen.T, s=16, color=INK)
-        axes.set(title=f"iteration {decision['iteration']}: {len(chosen)} of {len(contexts)}", xlabel="position of the gate")
+        axes.set(
+            title=f"iteration {decision['iteration']}: {len(chosen)} of {len(contexts)}", xlabel="position of the gate"
+        )
         axes.title.set_fontsize(10)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("width of the gate")

@@ -167,7 +167,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the files and folders that pages link to, and those that these link to."""
-    waiting = [path for file in files.documentation_pages() for path in linked(file.content_string, origin_of(file.src_uri))]
+    waiting = [
+        path for file in files.documentation_pages() for path in linked(file.content_string, origin_of(file.src_uri))
+    ]
     waiting += ["CHANGELOG.md", "CONTRIBUTING.md"]
     seen: set[str] = set()
     while waiting:
