@@ -34,7 +34,7 @@ check: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# The MLflow dashboard of runs in this folder, at http://127.0.0.1:5000
+# The MLflow dashboard of runs in this folder, at http://127.0.0.1:5000/#/experiments?workflowType=machine_learning
 ui: $(STAMP)
 	MLFLOW_DISABLE_TELEMETRY=true $(BIN)/mlflow ui --backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000
 

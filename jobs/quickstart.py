@@ -19,6 +19,7 @@ from space_dist.experiment.status import RunStatus
 
 ROOT = Path(__file__).resolve().parent.parent
 INSTANCES = 100
+PAGE = "http://127.0.0.1:5000/#/experiments?workflowType=machine_learning"
 
 
 def main() -> int:
@@ -42,7 +43,7 @@ def main() -> int:
         f"SPaCE's set reached all {INSTANCES} instances in {len(reached)} of {len(of_space)} runs"
         + ("" if len(reached) == len(of_space) else ": the start's value settles too slowly for this short budget")
     )
-    say(f"MLflow:  make ui, then http://127.0.0.1:5000 (experiment '{manifest.experiment}', {len(found)} runs)")
+    say(f"MLflow:  make ui, then {PAGE} (experiment '{manifest.experiment}', {len(found)} runs)")
     say("Next:    space-dist train configs/pointmass_space.yaml --seed 0   (README.md)")
     return 0
 

@@ -15,6 +15,8 @@ from hypothesis import settings
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"):
+    os.environ.pop(_name, None)
 os.environ.setdefault("RAY_worker_niceness", "0")  # beside other tests, the nice ones' turn would hardly ever come
 
 _MEMORY = Path("/dev/shm")  # noqa: S108 - pytest makes a folder of this user's own there

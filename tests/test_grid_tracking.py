@@ -26,7 +26,7 @@ from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, R
 from space_dist.experiment.status import Attempts
 from space_dist.ledger import METRICS, TIMING, Ledger, Lock, RunWriter
 from space_dist.tracking import NOTE_TAG, TrackingError, find, follow, sync
-from space_dist.tracking.grids import final_return, last_evaluation
+from space_dist.tracking.looking import final_return, last_evaluation
 from tests.grids import ROOT
 from tests.test_report import GROWTH, STARTED, continue_run, start_run
 from tests.test_tracking import contents, histories
@@ -95,16 +95,39 @@ def interrupted(folder: Path, uri: str, *seeds: int) -> Grid:
     return grid
 
 
-def everything(uri: str, experiment: str = "demo") -> tuple[MlflowRun, dict[str, MlflowRun]]:
-    """(the parent, its children by title); nothing else may be there."""
+@pytest.fixture(autouse=True)
+def reports(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The grids that were reported on, with a page instead of a report: drawing takes seconds."""
+    made: list[Path] = []
+
+    def write(grid: Grid, out: Path) -> None:
+        made.append(grid.folder)
+        (out / "report.html").write_text("a report")
+
+    monkeypatch.setattr("space_dist.report.build_grid_report", write)
+    return made
+
+
+def levels(uri: str, experiment: str = "demo") -> tuple[MlflowRun, dict[str, MlflowRun], dict[str, MlflowRun]]:
+    """(the grid, its cells by label, their runs by title); nothing else may be there, and each in its place."""
     client = MlflowClient(uri)
     found = client.get_experiment_by_name(experiment)
     assert found is not None
     runs = list(client.search_runs([found.experiment_id], max_results=1000))
-    (parent,) = [run for run in runs if "mlflow.parentRunId" not in run.data.tags]
-    children = {run.info.run_name: run for run in runs if run is not parent}
-    assert len(children) == len(runs) - 1
-    assert {run.data.tags["mlflow.parentRunId"] for run in children.values()} <= {parent.info.run_id}
+    (parent,) = [run for run in runs if run.data.tags["space_dist.level"] == "grid"]
+    cells = {run.info.run_name: run for run in runs if run.data.tags["space_dist.level"] == "cell"}
+    children = {run.info.run_name: run for run in runs if run.data.tags["space_dist.level"] == "run"}
+    assert len(cells) + len(children) == len(runs) - 1
+    assert "mlflow.parentRunId" not in parent.data.tags
+    assert {run.data.tags["mlflow.parentRunId"] for run in cells.values()} <= {parent.info.run_id}
+    for title, run in children.items():
+        assert run.data.tags["mlflow.parentRunId"] == cells[title.partition(",")[0]].info.run_id
+    return parent, cells, children
+
+
+def everything(uri: str, experiment: str = "demo") -> tuple[MlflowRun, dict[str, MlflowRun]]:
+    """(the grid, its runs by title)."""
+    parent, _, children = levels(uri, experiment)
     return parent, children
 
 
@@ -182,7 +205,10 @@ def test_retries_and_resumed_runs_stay_the_children_they_were(uri: str, tmp_path
 
     wider, _ = make_grid(grid.folder, uri, etas=(0.1, 0.2), seeds=(0, 1, 2))
     assert sync([], grids=[wider]).created == 0
-    assert everything(uri)[0].info.run_id == parent.info.run_id
+    widened, children = everything(uri)
+    assert widened.info.run_id != parent.info.run_id  # parameters of the plan are never changed
+    assert {name: run.info.run_id for name, run in children.items()} == before
+    assert (parent.data.params["seeds"], widened.data.params["seeds"]) == ("2", "3")
     assert everything(uri)[0].info.status == "RUNNING"
     assert "2 cells × 3 seeds" in everything(uri)[0].data.tags[NOTE_TAG]
 
@@ -235,11 +261,11 @@ def test_a_death_after_any_creation_doubles_nothing(
         raise ConnectionError(f"cut after {run.info.run_id}")
 
     monkeypatch.setattr(MlflowClient, "create_run", mortal)
-    for _ in range(3):
+    for _ in range(4):
         with pytest.raises(TrackingError, match="cut after"):
             sync([], grids=[grid])
     assert sync([], grids=[grid]).created == 0
-    assert calls == 3
+    assert calls == 4  # the grid, its cell, two runs
     _, children = everything(uri)
     assert [len(histories(uri, run)["test/return"]) for run in children.values()] == [2, 2]
 
@@ -319,8 +345,8 @@ def test_following_lasts_as_long_as_somebody_works_on_the_grid(uri: str, tmp_pat
 def test_following_a_grid_at_rest_asks_mlflow_nothing(
     uri: str,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch = pytest.MonkeyPatch()
     grid = interrupted(tmp_path / "demo", uri, 0)
     rounds = 0
 
@@ -379,8 +405,9 @@ def test_long_results_are_cut_in_the_description_and_whole_beside_it(uri: str, t
     assert 7000 < len(note) <= 8000
     shown = note.count("| `0000000000")
     assert f"{200 - shown} more cells are in results.md" in note
-    (artifact,) = MlflowClient(uri).list_artifacts(parent.info.run_id)
-    table = (tmp_path / "a store #1/mlartifacts" / parent.info.run_id / "artifacts" / artifact.path).read_text()
+    found = {artifact.path for artifact in MlflowClient(uri).list_artifacts(parent.info.run_id)}
+    assert found == {"manifest.json", "results.md"}
+    table = (tmp_path / "a store #1/mlartifacts" / parent.info.run_id / "artifacts/results.md").read_text()
     assert table.count("| `0000000000") == 200
 
 
@@ -449,11 +476,13 @@ def points_of(ledger: Ledger) -> list[tuple[str, int, int, float]]:
     """(metric, milliseconds, step, value) of all a ledger's numbers, sorted; written for the test alone."""
     points = []
     for row, timing in zip(ledger.rows(METRICS), ledger.rows(TIMING), strict=True):
-        numbers = {f"{section}/{key}": value for section in ("train", "test", "rollout", "learner", "curriculum")
+        sections = {"train": "train/", "test": "test/", "rollout": "train/rollout_", "learner": "train/learner_",
+                    "curriculum": "curriculum/"}  # fmt: skip
+        numbers = {f"{prefix}{key}": value for section, prefix in sections.items()
                    for key, value in row.get(section, {}).items()}  # fmt: skip
         if row["kind"] == "iteration":
-            numbers |= {key: row[key] for key in ("iteration", "round", "episodes")}
-        numbers["timing/steps_per_second"] = timing["steps_per_second"]
+            numbers |= {f"time/{key}": row[key] for key in ("iteration", "round", "episodes")}
+        numbers["time/steps_per_second"] = timing["steps_per_second"]
         points += [(key, round(timing["unix_time"] * 1000), row["steps"], float(value))
                    for key, value in numbers.items() if isinstance(value, int | float)]  # fmt: skip
     return sorted(points)
@@ -474,7 +503,7 @@ def test_a_server_that_was_killed_in_the_middle_has_everything_once_after_a_sync
         def fatal(*args: Any, **keywords: Any) -> Any:
             nonlocal batches
             batches += "metrics" in keywords
-            if batches == 2:
+            if batches == 4:  # two are the cells'
                 server.kill()
             return write(*args, **keywords)
 

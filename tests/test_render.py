@@ -24,7 +24,7 @@ from space_dist.rollout.policy import MlpPolicy, to_arrays
 from space_dist.run.building import Blueprint, spec_of
 from space_dist.run.launch import policy_of
 from space_dist.run.render import END_MILLISECONDS, MAX_FRAMES, draw_run
-from space_dist.tracking import store, sync
+from space_dist.tracking import drawing, sync
 from tests.commanding import command
 from tests.test_report import finished_run, written
 
@@ -202,7 +202,7 @@ def test_a_finished_runs_episodes_are_mirrored_and_a_failure_costs_a_warning(
 ) -> None:
     """The rows of a finished run, with the config, the sets and the policy of the corridor's."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(store, "_DRAW_SECONDS", 250.0)  # however slow the machine is
+    monkeypatch.setattr(drawing, "_DRAW_SECONDS", 250.0)  # however slow the machine is
     uri = f"sqlite:///{tmp_path / 'store' / 'mlflow.db'}"
     ledgers = [finished_run(tmp_path / f"run{number}", 1.0, seed=number) for number in range(2)]
     for ledger in ledgers:

@@ -348,6 +348,8 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
                      "--set", "partition=long", "--check")  # fmt: skip
     assert code == 0, said
     assert "6 runs in 2 array tasks" in said
+    assert f"mlflow.db is a file outside of {out}" in " ".join(said.split())
+    assert "MLFLOW_TRACKING_URI" in said
     assert "sbatch --test-only: no objection" in said
     text = (out / TRAIN).read_text()
     assert "#SBATCH --array=0-1%2\n" in text

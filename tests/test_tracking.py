@@ -77,11 +77,12 @@ def test_a_finished_run_is_mirrored_whole_and_once(uri: str, tmp_path: Path) -> 
     times = [round((start + 1.25 * row["row"]) * 1000) for row in ledger.rows(TIMING)]
     expected = [(number * STEPS, times[2 * number], value) for number, value in enumerate(TEST)]
     assert points["test/return"] == points["train/return"] == expected
-    assert points["learner/loss"] == [(n * STEPS, times[2 * n - 1], 1.0 / n) for n in range(1, 5)]
+    assert points["train/learner_loss"] == [(n * STEPS, times[2 * n - 1], 1.0 / n) for n in range(1, 5)]
     assert [value for _, _, value in points["curriculum/trained_size"]] == [1, 2, 4, 4]
     assert {value for _, _, value in points["curriculum/grew"]} == {1.0}
-    assert {name for name in points if "/" not in name} == {"episodes", "iteration", "round"}
-    assert not {"rollout/success", "curriculum/mean_value_after", "test/returns"} & set(points)
+    assert {name.partition("/")[0] for name in points} == {"curriculum", "test", "time", "train"}
+    assert {"time/episodes", "time/iteration", "time/round", "time/steps_per_second"} <= {*points}
+    assert not {"train/rollout_success", "curriculum/mean_value_after", "test/returns"} & set(points)
 
     again = sync([ledger])
     assert (again.runs, again.created, again.rows) == (1, 0, 0)
@@ -147,7 +148,7 @@ def test_more_rows_than_one_call_takes(uri: str, tmp_path: Path) -> None:
     points = histories(uri, only_run(uri))
     assert sum(len(history) for history in points.values()) > 2000
     assert [value for _, _, value in points["test/return"]] == [float(n) for n in range(many + 1)]
-    assert len(points["learner/loss"]) == many
+    assert len(points["train/learner_loss"]) == many
 
 
 def test_a_death_after_any_call_is_made_good(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -516,7 +516,7 @@ class _Rehearsal:
             children = store.execute(
                 "select count(*), count(distinct t.value) from tags t join runs r using (run_uuid)"
                 " where t.key = 'space_dist.folder' and r.lifecycle_stage = 'active' and exists (select 1 from tags p"
-                " where p.run_uuid = t.run_uuid and p.key = 'mlflow.parentRunId')"
+                " where p.run_uuid = t.run_uuid and p.key = 'space_dist.level' and p.value = 'run')"
             ).fetchone()  # fmt: skip
             if children != (len(self._all()), len(self._all())):
                 yield f"MLflow has {children[0]} children for {children[1]} folders, of {len(self._all())} runs"
@@ -540,11 +540,15 @@ def _sharing(chosen: _Live, live: Sequence[_Live]) -> list[_Live]:
 def _points(ledger: Ledger) -> Iterator[tuple[str, int, int, float]]:
     """(metric, milliseconds, step, value) of every number that MLflow must have once."""
     for row, timing in zip(ledger.rows(METRICS), ledger.rows(TIMING), strict=True):
-        numbers = {f"{section}/{key}": value for section in ("train", "test", "rollout", "learner", "curriculum")
+        sections = {"train": "train/", "test": "test/", "rollout": "train/rollout_", "learner": "train/learner_",
+                    "curriculum": "curriculum/"}  # fmt: skip
+        numbers = {f"{prefix}{key}": value for section, prefix in sections.items()
                    for key, value in row.get(section, {}).items()}  # fmt: skip
+        for setting in ("learning_rate", "clip_range"):  # which are the run's parameters
+            numbers.pop(f"train/learner_{setting}", None)
         if row["kind"] == "iteration":
-            numbers |= {key: row[key] for key in ("iteration", "round", "episodes", "gradient_steps")}
-        numbers["timing/steps_per_second"] = timing["steps_per_second"]
+            numbers |= {f"time/{key}": row[key] for key in ("iteration", "round", "episodes", "gradient_steps")}
+        numbers["time/steps_per_second"] = timing["steps_per_second"]
         for key, value in numbers.items():
             if isinstance(value, int | float):
                 yield key, round(timing["unix_time"] * 1000), row["steps"], float(value)

@@ -295,6 +295,8 @@ def sync(
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),
         highlight=False,
     )
+    for page in result.pages:
+        console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
     for folder, reason in result.failed.items():
         warn(f"space-dist: {folder} is not mirrored: {reason}")
     if result.failed:

@@ -78,6 +78,8 @@ def slurm_export(
         say(str(path))
     tasks = f"{made.n_tasks} array tasks" if mode == "array" else f"one job of {site.nodes} nodes"
     say(f"{manifest.name}: {made.n_runs} runs in {tasks}; {out / 'README.md'} says what to do with it")
+    if remark := made.tracking_remark(out):
+        warn(f"warning: {remark}")
     if check:
         _check(out)
 

@@ -62,7 +62,7 @@ def _type_name(field: Any) -> str:
               for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
               if hasattr(item, attribute)]  # fmt: skip
     if name.startswith("tuple"):
-        name = f"list of {re.findall(r'int|float|str', name)[0]}"
+        name = f"list of {re.findall(r'int|float|str|Literal[^]]*]', name)[0]}"
     return " ".join([name, *limits])
 
 

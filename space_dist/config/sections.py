@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from space_dist.config.tracking_uri import checked_uri
+from space_dist.config.tracking_uri import AUTO, checked_uri
 from space_dist.system.importing import why_refused
 
 MAX_LIST = 10_000  # values of a list in a config
+Sink = Literal["tensorboard", "wandb"]
+SINKS: tuple[Sink, ...] = get_args(Sink)
 _MAX_WORKERS = 4096
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
@@ -149,19 +151,39 @@ class CheckpointConfig(Section):
     """Seconds between checkpoints, at most (and at least one update)."""
 
 
-class TrackingConfig(Section):
-    """Where MLflow keeps its mirror of the run. Decides no result."""
+class Mirrors(Section):
+    """Where a run or a grid is shown. Decides no result."""
 
-    uri: str | None = Field(default="sqlite:///mlflow.db", max_length=2000)
-    """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; null: none."""
-    experiment: str = Field(default="space_dist", min_length=1, max_length=200)
-    """MLflow experiment."""
+    uri: str | None = Field(default=AUTO, max_length=2000)
+    """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; auto:
+    MLFLOW_TRACKING_URI of the environment, else sqlite:///mlflow.db; null: none."""
+    sinks: tuple[Sink, ...] = Field(default=(), max_length=len(SINKS), strict=False)
+    """Where else: tensorboard (event files) and wandb (Weights & Biases, offline), beside the run's own files. Each
+    needs its package: space-dist[tensorboard], space-dist[wandb]."""
 
     @field_validator("uri")
     @classmethod
     def _known_kind(cls, value: str | None) -> str | None:
-        return None if value is None else checked_uri(value)
+        return value if value in (None, AUTO) else checked_uri(value)
 
+    @field_validator("sinks")
+    @classmethod
+    def _once(cls, value: tuple[Sink, ...]) -> tuple[Sink, ...]:
+        if len({*value}) < len(value):
+            raise ValueError("every sink once")
+        return value
+
+    @property
+    def anywhere(self) -> bool:
+        """Whether there is anything to mirror to."""
+        return self.uri is not None or bool(self.sinks)
+
+
+class TrackingConfig(Mirrors):
+    """Where the run is shown: MLflow, TensorBoard, Weights & Biases. Decides no result."""
+
+    experiment: str | None = Field(default=None, min_length=1, max_length=200)
+    """MLflow experiment; null: MLFLOW_EXPERIMENT_NAME of the environment, else space_dist."""
     live: bool = True
     """Push while the run trains, from a process of its own. With false, `space-dist sync` pushes later."""
 

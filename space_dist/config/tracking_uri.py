@@ -1,16 +1,60 @@
-"""Tracking URIs: of which stores there can be a mirror."""
+"""Tracking URIs: of which stores there can be a mirror, and what the environment says of it.
+
+A config comes first, then MLflow's own variables in the environment, then the default. What they say is settled once,
+when a run begins or a grid is frozen, and written down with it: whoever mirrors it later needs no environment.
+"""
 
 from __future__ import annotations
 
+import os
 from typing import Final
 from urllib.parse import urlsplit
 
+from space_dist.errors import ConfigError
+
 ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
+AUTO: Final = "auto"
+DEFAULT: Final = "sqlite:///mlflow.db"
+URI_VARIABLE: Final = "MLFLOW_TRACKING_URI"
+EXPERIMENT_VARIABLE: Final = "MLFLOW_EXPERIMENT_NAME"
 _SQLITE: Final = "sqlite:///"
+_MAX_EXPERIMENT: Final = 200
 
 
 class UriError(ValueError):
     """What is wrong with a tracking URI: a sentence that shows of it what may be shown."""
+
+
+def settled_uri(uri: str | None) -> str | None:
+    """What a config's `tracking.uri` comes to here and now: `auto` is the environment's, and the default without.
+
+    Raises ConfigError for a store in the environment that is not mirrored to.
+    """
+    if uri != AUTO:
+        return uri
+    given = os.environ.get(URI_VARIABLE, "")
+    try:
+        return checked_uri(given) if given else DEFAULT
+    except UriError as error:
+        raise ConfigError(
+            f"{URI_VARIABLE} of the environment, which decides as tracking.uri is auto: {error}; tracking.uri: null "
+            "mirrors nowhere"
+        ) from None
+
+
+def settled_experiment(experiment: str | None, default: str) -> str:
+    """What a config's `tracking.experiment` comes to here and now: null is the environment's, and `default` without.
+
+    Raises ConfigError for a name in the environment that is too long.
+    """
+    if experiment is not None:
+        return experiment
+    given = os.environ.get(EXPERIMENT_VARIABLE, "")
+    if len(given) > _MAX_EXPERIMENT or not given.isprintable():
+        raise ConfigError(
+            f"{EXPERIMENT_VARIABLE} of the environment must be a printable name of at most {_MAX_EXPERIMENT} characters"
+        )
+    return given or default
 
 
 def checked_uri(uri: str) -> str:

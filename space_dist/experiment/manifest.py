@@ -23,8 +23,7 @@ from typing import Annotated, Any, Self
 from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
-from space_dist.config import NAME, Patience, ResourcesConfig, RunConfig, Section
-from space_dist.config.tracking_uri import checked_uri
+from space_dist.config import NAME, Mirrors, Patience, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.ledger import Ledger, owner_alive
 from space_dist.system.files import atomic_write
@@ -86,18 +85,11 @@ class Retry(Section):
     """Killed by an unknown hand (SIGKILL), or gone without a word."""
 
 
-class GridTracking(Section):
-    """Where MLflow keeps its mirror of the grid. Decides no result."""
+class GridTracking(Mirrors):
+    """Where the grid is shown: MLflow, TensorBoard, Weights & Biases. Decides no result."""
 
-    uri: str | None = Field(default="sqlite:///mlflow.db", max_length=2000)
-    """MLflow tracking URI: sqlite:///FILE (relative to the current folder) or http(s)://HOST:PORT; null: none."""
     experiment: str | None = Field(default=None, min_length=1, max_length=200)
-    """MLflow experiment; null: the grid's name."""
-
-    @field_validator("uri")
-    @classmethod
-    def _known_kind(cls, value: str | None) -> str | None:
-        return None if value is None else checked_uri(value)
+    """MLflow experiment; null: MLFLOW_EXPERIMENT_NAME of the environment, else the grid's name."""
 
 
 Axes = dict[str, list[Any]]
@@ -477,7 +469,7 @@ class Grid:
             **run.cell.config,
             "seed": run.seed,
             "resources": resources,
-            "tracking": {"uri": manifest.tracking.uri, "experiment": manifest.experiment, "live": False},
+            "tracking": {**manifest.tracking.model_dump(mode="json"), "experiment": manifest.experiment, "live": False},
         }
         configs.from_its_folder(data, self.folder)
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")

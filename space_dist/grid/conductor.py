@@ -309,8 +309,8 @@ def working_on(
     pusher = None
     try:
         grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
-        if manifest.tracking.uri is not None:
-            pusher = Pusher(manifest.tracking.uri, grid.folder, grid.tracking_log)
+        if manifest.tracking.anywhere:
+            pusher = Pusher(manifest.tracking, grid.folder, grid.tracking_log)
         yield
     finally:
         lock.release()  # by which the pusher knows that it may end

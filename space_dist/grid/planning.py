@@ -18,7 +18,7 @@ from space_dist.instances import InstanceSet
 from space_dist.run.building import Blueprint
 from space_dist.run.starting import weights_in
 from space_dist.system.provenance import code_digest, git_state, source_digest
-from space_dist.system.workplace import absolute_uri
+from space_dist.tracking.settling import settled
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def plan(path: Path, root: Path) -> Plan:
     manifest = Manifest(
         name=config.name, axes=tuple(config.axes()), cells=_distinct(cells.values()), seeds=config.seed_list(),
         resources=config.resources, retry=config.retry,
-        tracking=config.tracking.model_copy(update={"uri": absolute_uri(config.tracking.uri)}),
+        tracking=settled(config.tracking, config.name),
         baseline=_baseline(path, config, list(cells.values())),
         instances={name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.contents.items())},
         code=code_digest(), git=git_state(),

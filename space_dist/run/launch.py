@@ -48,8 +48,9 @@ from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import fingerprint
-from space_dist.system.workplace import absolute_uri, private_ray
+from space_dist.system.workplace import private_ray
 from space_dist.tracking.pusher import Pusher
+from space_dist.tracking.settling import settled
 
 log = logging.getLogger("space_dist")
 
@@ -141,6 +142,7 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 @contextlib.contextmanager
 def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
+    config = config.model_copy(update={"tracking": settled(config.tracking, "space_dist")})
     ledger, blueprint = Ledger(folder), Blueprint.of(config)
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
@@ -314,7 +316,6 @@ def _self_contained(config: RunConfig) -> RunConfig:
     return config.model_copy(
         update={
             "instances": config.instances.model_copy(update=instances),
-            "tracking": config.tracking.model_copy(update={"uri": absolute_uri(config.tracking.uri)}),
             "init_from": None if config.init_from is None else Path("init.npz"),
         }
     )
@@ -468,12 +469,10 @@ def _logging_to(path: Path) -> Iterator[None]:
 
 
 def _start_pusher(tracking: TrackingConfig, ledger: Ledger) -> Pusher | None:
-    if tracking.uri is None or not tracking.live:
+    if not (tracking.anywhere and tracking.live):
         return None
     try:
-        return Pusher(tracking.uri, ledger.folder, ledger.folder / "tracking.log")
+        return Pusher(tracking, ledger.folder, ledger.folder / "tracking.log")
     except OSError as error:
-        log.warning(
-            "nothing is pushed to MLflow while the run trains: %s. `space-dist sync` can do it later", in_words(error)
-        )
+        log.warning("nothing is mirrored while the run trains: %s. `space-dist sync` can do it later", in_words(error))
         return None

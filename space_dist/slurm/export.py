@@ -74,6 +74,19 @@ class Export:
         """Of an array task, or of each node."""
         return self.profile.cpus_per_task or self.manifest.cpus_per_run
 
+    def tracking_remark(self, folder: Path) -> str | None:
+        """What is to be known of the MLflow that scripts in `folder` carry: a file that may be this machine's own."""
+        uri = self.manifest.tracking.uri
+        results = (self.root or folder).absolute()
+        if uri is None or not uri.startswith("sqlite:") or Path(uri.removeprefix("sqlite:///")).is_relative_to(results):
+            return None
+        return (
+            f"tracking.uri: {uri} is a file outside of {results}: where the job that gathers the results does not see "
+            "it, it makes another one there. Set tracking.uri in the grid's file, or MLFLOW_TRACKING_URI, to "
+            f"http(s)://HOST:PORT or sqlite:///{results}/mlflow.db, and export again; or tracking.uri: null, and "
+            "`space-dist sync` later"
+        )
+
     @property
     def n_runs(self) -> int:
         """All of the grid's."""
@@ -272,7 +285,7 @@ def _values(grid: Export) -> dict[str, Any]:
         "root": None if grid.root is None else str(grid.root), "log_folders": grid.log_folders(), "jobs": JOBS,
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
-        "sync": manifest.tracking.uri is not None,
+        "sync": manifest.tracking.anywhere,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
         "env": {_Safe(name): value for name, value in profile.env.items()},
         "modules": profile.modules, "venv": profile.venv, "conda": profile.conda,

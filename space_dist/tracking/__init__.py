@@ -1,15 +1,16 @@
-"""MLflow as a mirror: committed rows of ledgers are replayed into experiments. The only importer of MLflow.
+"""Dashboards as mirrors: committed rows of ledgers are replayed. The only importer of MLflow.
 
     experiment -> one run for each run outside grids
-               -> one parent run for each grid -> one child for each of its runs that has begun
+               -> one parent run for each grid -> one for each cell -> one for each of its runs that has begun
 
 Every one is found by its tag `space_dist.run` before it is created, and pushing twice changes nothing: whatever MLflow
-loses or misses is pushed again from the ledgers.
+loses or misses is pushed again from the ledgers. Other sinks (`sinks`) are fed by the same replay.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import os
 import re
@@ -20,10 +21,13 @@ from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Any, Final
 
+from space_dist.config.sections import SINKS
+from space_dist.config.tracking_uri import settled_uri
 from space_dist.errors import LedgerError
 from space_dist.experiment.manifest import CELL_ID_DIGITS, MANIFEST, Grid
 from space_dist.ledger import Ledger, Status
 from space_dist.tracking.grids import GridMirror
+from space_dist.tracking.sinks import Sink, sink_of
 from space_dist.tracking.snapshot import NOTE_TAG, read_snapshot
 from space_dist.tracking.store import (
     GRID_TAG,
@@ -51,9 +55,10 @@ _CELL: Final = re.compile(rf"[0-9a-f]{{{CELL_ID_DIGITS}}}")
 class SyncResult:
     """What a `sync` did.
 
-    `runs` were brought up to date, `created` of them newly; `rows` of metrics.jsonl were pushed; `skipped` runs have
-    no tracking URI. A grid's runs that have not begun do not count. `failed` names, by folder, the runs that could not
-    be mirrored because their ledger is damaged or MLflow refused their content: whoever calls must show them.
+    `runs` were brought up to date, `created` of them newly; `rows` of metrics.jsonl were pushed; `skipped` runs are to
+    be shown nowhere. A grid's runs that have not begun do not count. `failed` names, by folder, the runs that could not
+    be mirrored because their ledger is damaged or MLflow refused their content: whoever calls must show them. `pages`
+    say where to look at what is in MLflow.
     """
 
     runs: int = 0
@@ -61,6 +66,14 @@ class SyncResult:
     rows: int = 0
     skipped: int = 0
     failed: Mapping[Path, str] = dataclass_field(default_factory=dict)
+    pages: tuple[str, ...] = ()
+
+    def plus(self, other: SyncResult) -> SyncResult:
+        """Both together."""
+        return SyncResult(
+            self.runs + other.runs, self.created + other.created, self.rows + other.rows, self.skipped + other.skipped,
+            {**self.failed, **other.failed}, tuple(dict.fromkeys((*self.pages, *other.pages))),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -164,9 +177,7 @@ def follow(
                 if failed.get(folder) != reason:
                     log.warning("%s is not mirrored: %s", folder, reason)
             failed = dict(done.failed)
-            total = SyncResult(
-                done.runs, total.created + done.created, total.rows + done.rows, done.skipped, done.failed
-            )
+            total = dataclasses.replace(done, created=total.created + done.created, rows=total.rows + done.rows)
             if stop is None and mirror.saw_life:  # it began meanwhile
                 last = False
         if last:
@@ -199,6 +210,7 @@ class _Mirror:
         self._uri = None if uri is None else usable_uri(uri)
         self._experiment = experiment
         self._stores: dict[str, Store] = {}
+        self._open_sinks: dict[str, Sink] = {}
         self._settled: dict[Path, tuple[Status, bool]] = {}
         self._grids: dict[Path, GridMirror] = {}
         self.saw_life = False
@@ -214,37 +226,38 @@ class _Mirror:
         self.saw_life, self.looking_seconds = False, 0.0
         total = self._push_runs(found.ledgers)
         for grid in found.grids:
-            done = self._push_grid(grid)
-            total = SyncResult(
-                total.runs + done.runs, total.created + done.created, total.rows + done.rows,
-                total.skipped + done.skipped, {**total.failed, **done.failed},
-            )  # fmt: skip
+            total = total.plus(self._push_grid(grid))
         return total
 
     def _push_runs(self, ledgers: Sequence[Ledger]) -> SyncResult:
-        runs = created = rows = skipped = 0
-        failed: dict[Path, str] = {}
+        total = SyncResult()
         for ledger in ledgers:
             try:
-                status, alive = ledger.status(), ledger.owner_alive()
-                self.saw_life |= alive
-                if self._settled.get(ledger.folder) == (status, alive):
-                    runs += 1
-                    continue
-                config = _config(ledger)
-                target = self._target(config, ledger)
-                if target is None:
-                    skipped += 1
-                    continue
-                store, experiment = self._store(target[0]), target[1]
-                with store.exclusively():
-                    _, new, pushed = store.push(read_snapshot(ledger, status, alive, config), experiment)
-            except (LedgerError, RefusedError) as error:
-                failed[ledger.folder] = str(error)
-                continue
-            runs, created, rows = runs + 1, created + new, rows + pushed
-            self._settled[ledger.folder] = (status, alive)
-        return SyncResult(runs, created, rows, skipped, failed)
+                total = total.plus(self._push_run(ledger))
+            except (LedgerError, RefusedError, OSError) as error:
+                total = total.plus(SyncResult(failed={ledger.folder: str(error)}))
+        return total
+
+    def _push_run(self, ledger: Ledger) -> SyncResult:
+        status, alive = ledger.status(), ledger.owner_alive()
+        self.saw_life |= alive
+        if self._settled.get(ledger.folder) == (status, alive):
+            return SyncResult(1)
+        config = _config(ledger)
+        target, sinks = self._target(config, ledger), self._sinks(_tracking(config).get("sinks"))
+        if target is None and not sinks:
+            return SyncResult(skipped=1)
+        snapshot = read_snapshot(ledger, status, alive, config)
+        for sink in sinks:
+            sink.push(snapshot)
+        result = SyncResult(1)
+        if target is not None:
+            store, experiment = self._store(target[0]), target[1]
+            with store.exclusively():
+                _, new, pushed = store.push(snapshot, experiment)
+            result = SyncResult(1, int(new), pushed, pages=(store.page(experiment),))
+        self._settled[ledger.folder] = (status, alive)
+        return result
 
     def _push_grid(self, grid: Grid) -> SyncResult:
         mirror, before = self._grid(grid), time.monotonic()
@@ -254,38 +267,52 @@ class _Mirror:
             return SyncResult(failed={grid.folder: str(error)})
         self.looking_seconds += time.monotonic() - before
         self.saw_life |= mirror.saw_life
-        uri = self._uri if self._uri is not None else manifest.tracking.uri
+        sinks = self._sinks(manifest.tracking.sinks)
+        if sinks:
+            mirror.feed(manifest, sinks)
+        uri = self._uri if self._uri is not None else settled_uri(manifest.tracking.uri)
         if uri is None:
-            return SyncResult(skipped=mirror.begun)
+            n_mirrored = mirror.begun - len(mirror.failed)
+            return SyncResult(n_mirrored, failed=mirror.failed) if sinks else SyncResult(skipped=mirror.begun)
+        store, experiment = self._store(usable_uri(uri)), self._experiment or manifest.experiment
         created = rows = 0
         if mirror.changed:
-            store = self._store(uri if self._uri is not None else usable_uri(uri))
             try:
-                created, rows = mirror.push(manifest, store, self._experiment or manifest.experiment)
+                created, rows = mirror.push(manifest, store, experiment)
             except RefusedError as error:
                 return SyncResult(failed={grid.folder: str(error)})
-        return SyncResult(mirror.begun - len(mirror.failed), created, rows, 0, mirror.failed)
+        pages = (store.page(experiment),)
+        return SyncResult(mirror.begun - len(mirror.failed), created, rows, 0, mirror.failed, pages)
 
     def _grid(self, grid: Grid) -> GridMirror:
         return self._grids.setdefault(grid.folder, GridMirror(grid))
 
     def _target(self, config: Mapping[str, Any], ledger: Ledger) -> tuple[str, str] | None:
         """(URI, experiment) for a run, None if it has no URI."""
-        tracking = config.get("tracking")
-        own: Mapping[str, Any] = tracking if isinstance(tracking, Mapping) else {}
+        own = _tracking(config)
         uri = self._uri if self._uri is not None else own.get("uri")
         experiment = self._experiment if self._experiment is not None else own.get("experiment")
         if uri is None:
             return None
         if not isinstance(experiment, str):
             raise LedgerError(f"{ledger.config} names no tracking.experiment; give one")
-        return (uri if self._uri is not None else usable_uri(str(uri))), experiment
+        return usable_uri(str(uri)), experiment
+
+    def _sinks(self, names: Any) -> list[Sink]:
+        """Sinks by the names in a run's config, or a grid's manifest."""
+        chosen = [name for name in SINKS if isinstance(names, Sequence) and name in names]
+        return [self._open_sinks.setdefault(name, sink_of(name)) for name in chosen]
 
     def _store(self, uri: str) -> Store:
         if uri not in self._stores:
             with store_errors(uri):
                 self._stores[uri] = Store(uri)
         return self._stores[uri]
+
+
+def _tracking(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    found = config.get("tracking")
+    return found if isinstance(found, Mapping) else {}
 
 
 def _config(ledger: Ledger) -> dict[str, Any]:

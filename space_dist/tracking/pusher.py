@@ -1,4 +1,4 @@
-"""The process that keeps MLflow's mirror of a run or of a grid, as whoever started it sees it."""
+"""The process that keeps the mirrors of a run or of a grid, as whoever started it sees it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 from typing import Final, Literal
 
+from space_dist.config import Mirrors
 from space_dist.system.files import appending
 from space_dist.system.importing import PYTHON
 
@@ -18,12 +19,13 @@ _KILL_SECONDS: Final = 5.0
 class Pusher:
     """One process that pushes all there is in a folder: a store has one writer, and a slow server costs no training.
 
-    uri: of the store, for messages.  folder: a run's or a grid's.  log_file: where it writes what it says.  Raises
+    tracking: where to, for messages.  folder: a run's or a grid's.  log_file: where it writes what it says.  Raises
     OSError if that cannot be written or no process can be started.
     """
 
-    def __init__(self, uri: str, folder: Path, log_file: Path) -> None:
-        self._uri, self._folder, self._log_file = uri, folder, log_file
+    def __init__(self, tracking: Mirrors, folder: Path, log_file: Path) -> None:
+        places = [f"MLflow at {tracking.uri}"] if tracking.uri is not None else []
+        self._where, self._folder, self._log_file = " and ".join([*places, *tracking.sinks]), folder, log_file
         command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(folder)]
         with appending(log_file) as output:
             # A session of its own: Ctrl-C is for the work; the pusher ends by itself once whoever works has let go.
@@ -36,7 +38,7 @@ class Pusher:
         if ended_within(self._process, seconds):
             return None
         return (
-            f"MLflow at {self._uri} could not be brought up to date; nothing is lost: `space-dist sync {self._folder}` "
+            f"{self._where} could not be brought up to date; nothing is lost: `space-dist sync {self._folder}` "
             f"replays the {what} (details: {self._log_file})"
         )
 

@@ -1,4 +1,4 @@
-"""What of a run is to be mirrored to MLflow, read from its folder before MLflow is asked anything."""
+"""What of a run is to be shown elsewhere, read from its folder before any sink is asked anything."""
 
 from __future__ import annotations
 
@@ -6,34 +6,106 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
 
 from space_dist.config import flattened
 from space_dist.errors import LedgerError
 from space_dist.ledger import METRICS, TIMING, Ledger, Row, Status
 
-if TYPE_CHECKING:
-    from mlflow.entities import Metric
-
 STARTED_TAG: Final = "space_dist.started"
+LEVEL_TAG: Final = "space_dist.level"  # grid, cell or run
 NOTE_TAG: Final = "mlflow.note.content"  # a run's description, in Markdown
 
 MAX_TAG, _MAX_PARAM, _MAX_KEY = 8000, 6000, 250  # characters; mlflow/utils/validation.py
 
 
+class Point(NamedTuple):
+    """One number of a curve. milliseconds: since the epoch. step: real environment steps."""
+
+    name: str
+    value: float
+    milliseconds: int
+    step: int
+
+
+class Record(Protocol):
+    """What every sink can show: a run, or a cell of a grid.
+
+    Its rows come in order and never change, except where `continues` says so. All is plain: text, numbers, paths.
+    """
+
+    @property
+    def key(self) -> str:
+        """`(32 hex digits)` by which it is found again."""
+
+    @property
+    def title(self) -> str:
+        """What it is called."""
+
+    @property
+    def root(self) -> Path:
+        """The folder of the run outside grids, or of the grid: local sinks write into folders of their own there."""
+
+    @property
+    def name(self) -> str:
+        """Its place among what is in `root`: a relative path of plain letters, empty for a run outside grids."""
+
+    @property
+    def group(self) -> str:
+        """What it belongs to: the label of a cell, or a run's name."""
+
+    @property
+    def params(self) -> Mapping[str, str]:
+        """`section.key` -> text of what stays constant."""
+
+    @property
+    def tags(self) -> Mapping[str, str]:
+        """The others, which may change."""
+
+    @property
+    def mlflow_status(self) -> str:
+        """RUNNING, FINISHED, FAILED or KILLED."""
+
+    @property
+    def started_at(self) -> float:
+        """Seconds since the epoch."""
+
+    @property
+    def ended_at(self) -> float:
+        """Seconds since the epoch."""
+
+    @property
+    def stamp(self) -> str:
+        """Changes whenever anything that is pushed does; empty where that is not known."""
+
+    @property
+    def intent(self) -> str:
+        """What its rows are; noted wherever they go before the first of them goes there."""
+
+    def continues(self, intent: str) -> bool:
+        """Whether rows that were noted so are the first ones of these."""
+
+    def points(self, start: int) -> Iterator[tuple[int, Point]]:
+        """(rows complete once this is pushed, point) from row `start` on."""
+
+
 @dataclass(frozen=True)
 class Part:
-    """What a run is to MLflow as a part of a grid.
+    """What a run is as a part of a grid.
 
     key: `(32 hex digits)` of grid, cell and seed. title: the child's name. remark: the end of its description.
-    tags: more of them, the parent's id among them. ending: how it stands in MLflow's words. ended_at: seconds since
-    the epoch. stamp: changes whenever anything that is pushed does; a child that has it is up to date.
+    root, name, group: as those of a `Record`. tags: more of them. ending: how it stands in MLflow's words. ended_at:
+    seconds since the epoch. stamp: changes whenever anything that is pushed does; a child that has it is up to date.
     shows_episodes: whether its policy is drawn when it is done: drawing takes seconds, so one seed of a cell is enough.
     """
 
     key: str
     title: str
     remark: str
+    root: Path
+    name: str
+    group: str
     tags: Mapping[str, str]
     ending: str
     ended_at: float
@@ -71,6 +143,21 @@ class Snapshot:
         return self.part.title if self.part is not None else f"{self.status.name}-s{self.status.seed}"
 
     @property
+    def root(self) -> Path:
+        """Its grid's folder, or its own."""
+        return self.part.root if self.part is not None else self.ledger.folder
+
+    @property
+    def name(self) -> str:
+        """Its place among the runs of its grid."""
+        return self.part.name if self.part is not None else ""
+
+    @property
+    def group(self) -> str:
+        """The label of its cell, or its name."""
+        return self.part.group if self.part is not None else self.status.name
+
+    @property
     def mlflow_status(self) -> str:
         """RUNNING, FINISHED, FAILED or KILLED."""
         if self.part is not None:
@@ -80,9 +167,57 @@ class Snapshot:
         return {"done": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}[self.status.state]
 
     @property
+    def started_at(self) -> float:
+        """Seconds since the epoch."""
+        return self.status.started_at
+
+    @property
     def ended_at(self) -> float:
         """Seconds since the epoch."""
         return self.part.ended_at if self.part is not None else self.status.updated_at
+
+    @property
+    def stamp(self) -> str:
+        """Of a part of a grid."""
+        return self.part.stamp if self.part is not None else ""
+
+    @property
+    def intent(self) -> str:
+        """When the run was first started: rows of another one in its folder are others."""
+        return repr(self.status.started_at)
+
+    def continues(self, intent: str) -> bool:
+        """Whether rows are of this run."""
+        return intent == self.intent
+
+    @property
+    def params(self) -> dict[str, str]:
+        """Its config."""
+        return as_params(self.config)
+
+    @property
+    def tags(self) -> dict[str, str]:
+        """Where it stands, and what computed it."""
+        return _tags_of(self)
+
+    def points(self, start: int) -> Iterator[tuple[int, Point]]:
+        """(rows complete once this is pushed, point) from row `start` on, each row's own time and real step."""
+        constant = _constant(self.config)
+        for index in range(start, len(self.rows)):
+            row, timing = self.rows[index], self.timing[index]
+            try:
+                milliseconds, steps, rate = (
+                    round(timing["unix_time"] * 1000),
+                    int(row["steps"]),
+                    timing["steps_per_second"],
+                )
+                numbers = [(name, value) for name, value in _numbers(row) if name not in constant]
+            except (KeyError, TypeError, AttributeError, ValueError) as error:
+                raise LedgerError(f"{self.ledger.folder / METRICS}, row {index + 1}: {error!r}") from None
+            if rate is not None:
+                numbers.append(("time/steps_per_second", float(rate)))
+            for position, (name, value) in enumerate(numbers):
+                yield index + (position + 1 == len(numbers)), Point(name, value, milliseconds, steps)
 
 
 def key_of(*parts: str) -> str:
@@ -110,34 +245,34 @@ def read_snapshot(
     return Snapshot(ledger, status, alive, config, rows, timing, note, part)
 
 
+_GROUPS: Final = {"test": "test/", "train": "train/", "rollout": "train/rollout_", "learner": "train/learner_",
+                  "curriculum": "curriculum/"}  # fmt: skip
+
+
 def _numbers(row: Row) -> Iterator[tuple[str, float]]:
-    """(metric name, value) of each number of a row; per-instance lists, nulls and words are none."""
+    """(metric name, value) of each number of a row; per-instance lists, nulls and words are none.
+
+    Dashboards put those together that have the part before the slash in common.
+    """
     sections = ("train", "test") if row["kind"] == "evaluation" else ("rollout", "learner", "curriculum")
     for section in sections:
         for name, value in row[section].items():
             if isinstance(value, int | float):
-                yield f"{section}/{name}", float(value)
+                yield f"{_GROUPS[section]}{name}", float(value)
     if row["kind"] == "iteration":
         for name, value in row.items():
             if isinstance(value, int | float) and name not in ("steps", "complete"):
-                yield name, float(value)
+                yield f"time/{name}", float(value)
 
 
-def metrics_of(snapshot: Snapshot, start: int) -> Iterator[tuple[int, Metric]]:
-    """(rows complete once this is pushed, metric) from row `start` on, each row's own time and real step."""
-    from mlflow.entities import Metric
-
-    for index in range(start, len(snapshot.rows)):
-        row, timing = snapshot.rows[index], snapshot.timing[index]
-        try:
-            milliseconds, steps, numbers = round(timing["unix_time"] * 1000), int(row["steps"]), list(_numbers(row))
-            rate = timing["steps_per_second"]
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise LedgerError(f"{snapshot.ledger.folder / METRICS}, row {index + 1}: {error!r}") from None
-        if rate is not None:
-            numbers.append(("timing/steps_per_second", float(rate)))
-        for position, (name, value) in enumerate(numbers):
-            yield index + (position + 1 == len(numbers)), Metric(name, value, milliseconds, steps)
+def _constant(config: Mapping[str, Any]) -> set[str]:
+    """Metrics that say a setting again at every step: what stays constant is a parameter."""
+    learner = config.get("learner")
+    own: Mapping[str, Any] = learner if isinstance(learner, Mapping) else {}
+    return {
+        f"{_GROUPS['learner']}{key}" for key in ("learning_rate", "clip_range")
+        if key in own and own.get(f"{key}_schedule", "constant") == "constant"
+    }  # fmt: skip
 
 
 def as_params(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -147,11 +282,12 @@ def as_params(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return {key[:_MAX_KEY]: text[:_MAX_PARAM] for key, text in texts}
 
 
-def tags_of(snapshot: Snapshot) -> dict[str, str]:
+def _tags_of(snapshot: Snapshot) -> dict[str, str]:
     status = snapshot.status
     tags = {
         "space_dist.seed": str(status.seed),
         "space_dist.name": status.name,
+        LEVEL_TAG: "run",
         "space_dist.state": status.state,
         STARTED_TAG: repr(status.started_at),
         "space_dist.folder": str(snapshot.ledger.folder),

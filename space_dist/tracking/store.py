@@ -1,54 +1,58 @@
-"""One run into one MLflow store: the calls that bring there what `snapshot` says.
+"""One record into one MLflow store: the calls that bring there what a run, a cell or a grid is.
 
-`space_dist.synced_rows` says how many rows of metrics.jsonl are there. That tag is written after the rows it counts:
-what dies in between pushes some points again, and MLflow keeps a point of the same (key, time, step, value) once.
+`space_dist.rows` says how many rows of a record are there. That tag is written after the rows it counts: what dies in
+between pushes some points again, and MLflow keeps a point of the same (key, time, step, value) once. Which rows they
+are is written before them, into `space_dist.points`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import re
+import shlex
 import sqlite3
-import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from space_dist.config.tracking_uri import UriError, checked_uri
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
-from space_dist.ledger import METRICS, Ledger
+from space_dist.ledger import METRICS
 from space_dist.system.extras import needed_from
 from space_dist.system.files import in_words, locked
-from space_dist.system.importing import PYTHON
 from space_dist.system.workplace import absolute_uri
-from space_dist.tracking.snapshot import STARTED_TAG, Snapshot, as_params, key_of, metrics_of, tags_of
+from space_dist.tracking.drawing import draw
+from space_dist.tracking.snapshot import Record, Snapshot, key_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric
     from mlflow.entities import Run as MlflowRun
 
-    from space_dist.report.load import Run as LoadedRun
-
-log = logging.getLogger("space_dist.tracking")
-
 RUN_TAG: Final = "space_dist.run"
-ROWS_TAG: Final = "space_dist.synced_rows"
+ROWS_TAG: Final = "space_dist.rows"
+INTENT_TAG: Final = "space_dist.points"
+PARENT_TAG: Final = "mlflow.parentRunId"
+PLAN_TAG: Final = "space_dist.plan"
+FILES_TAG: Final = "space_dist.files"
+REPORT_TAG: Final = "space_dist.report"
 ARTIFACTS_TAG: Final = "space_dist.artifacts"
 GRID_TAG: Final = "space_dist.grid_key"
 STAMP_TAG: Final = "space_dist.stamp"
 TABLE_TAG: Final = "space_dist.results"
 
+# By which MLflow tells an experiment's kind. From 3.10 on its pages ask the browser first, whose own choice is language
+# models until somebody makes another one: the addresses that we show make it.
+_EXPERIMENT_KIND: Final = ("mlflow.experimentKind", "custom_model_development")
 _MAX_METRICS, _MAX_PARAMS, _MAX_TAGS = 1000, 100, 100  # a call of log_batch; mlflow/utils/validation.py
 _PAGE: Final = 200  # runs with all their data in one answer
 _DATABASE_WAIT_SECONDS: Final = 20.0
 _TURN_SECONDS: Final = 600.0  # a grid of thousands of runs takes minutes
-_DRAW_SECONDS: Final = 30.0  # for the pictures of a run
 # MLflow's own defaults print a line a run and call home.
 _ENVIRONMENT: Final = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -67,23 +71,36 @@ class Child:
     run_id: str
     stamp: str
     ending: str
+    parent: str | None
 
 
 @dataclass(frozen=True)
 class Parent:
     """A grid as a run of its own.
 
-    key: `(32 hex digits)` by which it is found. tags: its description among them. table: results that are too long for
-    the description, in Markdown. Times are seconds since the epoch.
+    key: `(32 hex digits)` by which it is found. tags: its description among them. params: the plan; MLflow takes no
+    change of a parameter, so another plan is another run. metrics: numbers of now. files: which belong beside it.
+    table: results that are too long for the description, in Markdown. report: writes the grid's report into a folder;
+    None while it may not be made. report_stamp: changes whenever that report would. Times are seconds since the epoch.
     """
 
     key: str
     name: str
     tags: Mapping[str, str]
+    params: Mapping[str, str]
+    metrics: Mapping[str, float]
+    files: Sequence[Path]
     table: str | None
+    report: Callable[[Path], object] | None
+    report_stamp: str
     ending: str
     started_at: float
     ended_at: float
+
+    @property
+    def plan(self) -> str:
+        """`(32 hex digits)` of its parameters."""
+        return key_of(repr(sorted(self.params.items())))
 
 
 class RefusedError(Exception):
@@ -119,22 +136,40 @@ class Store:
             yield
 
     def push(
-        self, snapshot: Snapshot, experiment: str, run_id: str | None = None, *, known_new: bool = False
-    ) -> tuple[str, bool, int]:
+        self, record: Record, experiment: str, run_id: str | None = None, *, known_new: bool = False,
+        parent: str | None = None,
+    ) -> tuple[str, bool, int]:  # fmt: skip
         """(id of the run there, whether it is new, rows pushed).
 
-        run_id: what it was when last seen. known_new: it need not be searched for.
+        run_id: what it was when last seen. known_new: it need not be searched for. parent: id of the run it belongs to.
         """
         with store_errors(self._uri):
-            run, created = self._find_or_create(snapshot, self._experiment_id(experiment), run_id, known_new)
-            self._push_params(run, snapshot)
-            pushed = self._push_rows(run, snapshot)
-            self._push_status(run, snapshot)
-            if snapshot.started:
-                self._push_artifacts(run, snapshot)
-            if snapshot.part is not None and run.data.tags.get(STAMP_TAG) != snapshot.part.stamp:
-                self._client.set_tag(run.info.run_id, STAMP_TAG, snapshot.part.stamp)  # last: all else is there
+            tags = {**record.tags, **({} if parent is None else {PARENT_TAG: parent})}
+            run, created = self._find_or_create(record, tags, self._experiment_id(experiment), run_id, known_new)
+            self._push_params(run, record.params)
+            pushed = self._push_rows(run, record)
+            self._push_tags(run, tags)
+            self._push_ending(run, record.mlflow_status, record.ended_at)
+            if isinstance(record, Snapshot) and record.started:
+                self._push_artifacts(run, record)
+            if record.stamp and run.data.tags.get(STAMP_TAG) != record.stamp:
+                self._client.set_tag(run.info.run_id, STAMP_TAG, record.stamp)  # last: all else is there
             return str(run.info.run_id), created, pushed
+
+    def adopt(self, run_ids: Iterable[str], parent: str) -> None:
+        """Have runs belong to another one."""
+        with store_errors(self._uri):
+            for run_id in run_ids:
+                self._client.set_tag(run_id, PARENT_TAG, parent)
+
+    def page(self, experiment: str) -> str:
+        """Where people look at an experiment's runs, in words."""
+        with store_errors(self._uri):
+            place = f"/#/experiments/{self._experiment_id(experiment)}/runs?workflowType=machine_learning"
+        if self._uri.startswith("sqlite:"):
+            serve = shlex.join(["mlflow", "ui", "--backend-store-uri", self._uri])
+            return f"http://127.0.0.1:5000{place} once `{serve}` runs"
+        return f"{self._uri}{place}"
 
     def children(self, experiment: str, grid_key: str) -> dict[str, Child]:
         """The runs of a grid that are there, by their key. Takes milliseconds for each, so it is asked once."""
@@ -147,42 +182,43 @@ class Store:
                 )
                 for run in runs:
                     tags = run.data.tags
-                    child = Child(str(run.info.run_id), tags.get(STAMP_TAG, ""), str(run.info.status))
+                    child = Child(
+                        str(run.info.run_id), tags.get(STAMP_TAG, ""), str(run.info.status), tags.get(PARENT_TAG)
+                    )
                     key = tags.get(RUN_TAG, "")
                     found[key] = min(child, found.get(key, child), key=lambda one: one.run_id)
                 page = runs.token
                 if not page:
                     return found
 
-    def find_parent(self, key: str, experiment: str) -> str | None:
-        """The id of a grid's own run, if it is there."""
+    def find_parent(self, parent: Parent, experiment: str) -> str | None:
+        """The id of a grid's own run, if it is there; one of another plan goes into MLflow's trash."""
         with store_errors(self._uri):
-            found = self._client.search_runs([self._experiment_id(experiment)], f"tags.`{RUN_TAG}` = '{key}'")
-            return min((str(run.info.run_id) for run in found), default=None)
+            found = self._client.search_runs([self._experiment_id(experiment)], f"tags.`{RUN_TAG}` = '{parent.key}'")
+            for run in found:
+                if run.data.tags.get(PLAN_TAG) != parent.plan:
+                    self._client.delete_run(run.info.run_id)
+            return min(
+                (str(run.info.run_id) for run in found if run.data.tags.get(PLAN_TAG) == parent.plan), default=None
+            )
 
     def create_parent(self, parent: Parent, experiment: str) -> str:
         """The id of a grid's own run, which is not there yet."""
         with store_errors(self._uri):
-            tags = {RUN_TAG: parent.key, **parent.tags}
-            start = round(parent.started_at * 1000)
             run = self._client.create_run(
-                self._experiment_id(experiment), start_time=start, tags=tags, run_name=parent.name
-            )
+                self._experiment_id(experiment), start_time=round(parent.started_at * 1000),
+                tags={RUN_TAG: parent.key, PLAN_TAG: parent.plan, **parent.tags}, run_name=parent.name,
+            )  # fmt: skip
             return str(run.info.run_id)
 
     def push_parent(self, parent: Parent, run_id: str) -> None:
         """Bring a grid's own run up to date."""
-        from mlflow.entities import RunTag
-
         with store_errors(self._uri):
             run = self._client.get_run(run_id)
-            changed = [RunTag(key, value) for key, value in parent.tags.items() if run.data.tags.get(key) != value]
-            for start in range(0, len(changed), _MAX_TAGS):
-                self._client.log_batch(run_id, tags=changed[start : start + _MAX_TAGS])
-            table = key_of(parent.table or "")
-            if parent.table is not None and run.data.tags.get(TABLE_TAG) != table:
-                self._client.log_text(run_id, parent.table, "results.md")
-                self._client.set_tag(run_id, TABLE_TAG, table)
+            self._push_params(run, parent.params)
+            self._push_numbers(run, parent.metrics)
+            self._push_tags(run, parent.tags)
+            self._push_files(run, parent)
             self._push_ending(run, parent.ending, parent.ended_at)
 
     def _experiment_id(self, name: str) -> str:
@@ -193,7 +229,9 @@ class Store:
         found = self._client.get_experiment_by_name(name)
         if found is None:
             try:
-                identity = self._client.create_experiment(name, artifact_location=self._artifact_location)
+                identity = self._client.create_experiment(
+                    name, artifact_location=self._artifact_location, tags=dict([_EXPERIMENT_KIND])
+                )
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
@@ -207,46 +245,40 @@ class Store:
                     "name (tracking.experiment)"
                 )
             identity = str(found.experiment_id)
+            if _EXPERIMENT_KIND[0] not in found.tags:
+                self._client.set_experiment_tag(identity, *_EXPERIMENT_KIND)
         self._experiments[name] = identity
         return identity
 
     def _find_or_create(
-        self, snapshot: Snapshot, experiment_id: str, run_id: str | None, known_new: bool
+        self, record: Record, tags: Mapping[str, str], experiment_id: str, run_id: str | None, known_new: bool
     ) -> tuple[MlflowRun, bool]:
         found = [] if run_id is None else [self._client.get_run(run_id)]
         found = [run for run in found if run.info.lifecycle_stage == "active"]
         if not found and not known_new:
-            found = self._client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{snapshot.key}'")
+            found = self._client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{record.key}'")
         if found:
             run = min(found, key=lambda run: str(run.info.run_id))
-            if snapshot.part is None or not self._superseded(run, snapshot):
+            noted = run.data.tags.get(INTENT_TAG)
+            if noted is None or record.continues(noted):
                 return run, False
             self._client.delete_run(run.info.run_id)  # into MLflow's trash; points cannot be taken back singly
-        status = snapshot.status
         run = self._client.create_run(
-            experiment_id,
-            start_time=round(status.started_at * 1000),
-            tags={RUN_TAG: snapshot.key, **tags_of(snapshot)},
-            run_name=snapshot.title,
-        )
+            experiment_id, start_time=round(record.started_at * 1000), tags={RUN_TAG: record.key, **tags},
+            run_name=record.title,
+        )  # fmt: skip
         return run, True
 
-    @staticmethod
-    def _superseded(run: MlflowRun, snapshot: Snapshot) -> bool:
-        """Whether points are there of another run in the same folder, which was removed to start afresh."""
-        there = run.data.tags.get(ROWS_TAG, "0") != "0"
-        return there and run.data.tags.get(STARTED_TAG) != tags_of(snapshot)[STARTED_TAG]
-
-    def _push_params(self, run: MlflowRun, snapshot: Snapshot) -> None:
+    def _push_params(self, run: MlflowRun, params: Mapping[str, str]) -> None:
         """Those that are not there yet: a param never changes, and a batch that was cut off is completed."""
         from mlflow.entities import Param
 
-        missing = [Param(key, value) for key, value in as_params(snapshot.config).items() if key not in run.data.params]
+        missing = [Param(key, value) for key, value in params.items() if key not in run.data.params]
         for start in range(0, len(missing), _MAX_PARAMS):
             self._client.log_batch(run.info.run_id, params=missing[start : start + _MAX_PARAMS])
 
-    def _push_rows(self, run: MlflowRun, snapshot: Snapshot) -> int:
-        from mlflow.entities import RunTag
+    def _push_rows(self, run: MlflowRun, record: Record) -> int:
+        from mlflow.entities import Metric, RunTag
 
         there = _whole_number(run.data.tags.get(ROWS_TAG, "0"))
         batch: list[Metric] = []
@@ -258,13 +290,42 @@ class Store:
             batch.clear()
 
         complete = there
-        for complete, metric in metrics_of(snapshot, there):
-            batch.append(metric)
+        for complete, point in record.points(there):
+            if not batch and run.data.tags.get(INTENT_TAG) != record.intent:
+                self._client.set_tag(run.info.run_id, INTENT_TAG, record.intent)
+                run.data.tags[INTENT_TAG] = record.intent
+            batch.append(Metric(point.name, point.value, point.milliseconds, point.step))
             if len(batch) == _MAX_METRICS:
                 send(complete)
         if batch:
             send(complete)
         return complete - there
+
+    def _push_numbers(self, run: MlflowRun, numbers: Mapping[str, float]) -> None:
+        """Numbers of now that are not there: MLflow shows the latest."""
+        from mlflow.entities import Metric
+
+        now = round(time.time() * 1000)
+        changed = [Metric(key, value, now, 0) for key, value in numbers.items() if run.data.metrics.get(key) != value]
+        for start in range(0, len(changed), _MAX_METRICS):
+            self._client.log_batch(run.info.run_id, metrics=changed[start : start + _MAX_METRICS])
+
+    def _push_files(self, run: MlflowRun, parent: Parent) -> None:
+        """Files, tables and the report of a grid, each when it has changed."""
+        run_id, tags = run.info.run_id, run.data.tags
+        if tags.get(FILES_TAG) != parent.plan:
+            for file in parent.files:
+                self._client.log_artifact(run_id, str(file))
+            self._client.set_tag(run_id, FILES_TAG, parent.plan)
+        table = key_of(parent.table or "")
+        if parent.table is not None and tags.get(TABLE_TAG) != table:
+            self._client.log_text(run_id, parent.table, "results.md")
+            self._client.set_tag(run_id, TABLE_TAG, table)
+        if parent.report is not None and tags.get(REPORT_TAG) != parent.report_stamp:
+            with tempfile.TemporaryDirectory() as folder:
+                parent.report(Path(folder))
+                self._client.log_artifacts(run_id, folder)
+            self._client.set_tag(run_id, REPORT_TAG, parent.report_stamp)
 
     def _push_artifacts(self, run: MlflowRun, snapshot: Snapshot) -> None:
         """The config at once; all that makes a run reusable and readable when it is done."""
@@ -281,21 +342,20 @@ class Store:
                 raise LedgerError(f"{ledger.folder} is done but has no {', '.join(missing)}")
             with tempfile.TemporaryDirectory() as folder:
                 episodes = snapshot.part is None or snapshot.part.shows_episodes
-                for figure in _draw(ledger, Path(folder), episodes=episodes):
+                for figure in draw(ledger, Path(folder), episodes=episodes):
                     self._client.log_artifact(run.info.run_id, str(figure), "figures")
         for file in files:
             ledger.read(file)  # is it what the run wrote?
             self._client.log_artifact(run.info.run_id, str(file))
         self._client.set_tag(run.info.run_id, ARTIFACTS_TAG, wanted)
 
-    def _push_status(self, run: MlflowRun, snapshot: Snapshot) -> None:
-        """Tags and status, after the rows: nothing may look finished before its numbers are there."""
+    def _push_tags(self, run: MlflowRun, tags: Mapping[str, str]) -> None:
+        """After the rows: nothing may look finished before its numbers are there."""
         from mlflow.entities import RunTag
 
-        changed = [RunTag(key, value) for key, value in tags_of(snapshot).items() if run.data.tags.get(key) != value]
+        changed = [RunTag(key, value) for key, value in tags.items() if run.data.tags.get(key) != value]
         for start in range(0, len(changed), _MAX_TAGS):
             self._client.log_batch(run.info.run_id, tags=changed[start : start + _MAX_TAGS])
-        self._push_ending(run, snapshot.mlflow_status, snapshot.ended_at)
 
     def _push_ending(self, run: MlflowRun, wanted: str, ended_at: float) -> None:
         end = round(ended_at * 1000)
@@ -304,45 +364,6 @@ class Store:
                 self._client.update_run(run.info.run_id, status=wanted)
         elif (run.info.status, run.info.end_time) != (wanted, end):
             self._client.set_terminated(run.info.run_id, wanted, end_time=end)
-
-
-def _draw(ledger: Ledger, folder: Path, *, episodes: bool) -> list[Path]:
-    """Figures of a finished run in `folder`; with `episodes`, what its policy does, too."""
-    from space_dist.report import draw_curriculum, draw_learning_curve, load_run, save
-
-    run = load_run(ledger)
-    figures = {}
-    if len(run.evaluation_steps):
-        figures["learning_curve.png"] = draw_learning_curve(run)
-    if len(run.set_sizes):
-        figures["curriculum.png"] = draw_curriculum(run)
-    for name, figure in figures.items():
-        save(figure, folder / name)
-    return [folder / name for name in figures] + (_draw_episodes(run, folder / "episodes") if episodes else [])
-
-
-def _draw_episodes(run: LoadedRun, folder: Path) -> list[Path]:
-    """What the policy does, in GIFs and PNGs, for our own environments and policies that act without torch.
-
-    In a process of its own, which can be ended when it takes too long; a failure costs a warning.
-    """
-    ledger = run.ledger
-    try:
-        env_id = str(run.config["env"]["id"])
-        policy = json.loads(ledger.model_description.read_bytes())["policy"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []  # nothing that acts
-    if policy == "torch" or not env_id.startswith("space_dist/"):
-        return []
-    command = [*PYTHON, "-m", "space_dist.cli", "render", "--out", str(folder), "--", str(ledger.folder)]
-    try:
-        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_DRAW_SECONDS, check=True)
-    except subprocess.CalledProcessError as error:
-        said = error.stderr.decode(errors="replace").strip()
-        log.warning("%s: its episodes were not drawn: %s", ledger.folder, said[:300])
-    except (subprocess.TimeoutExpired, OSError) as error:
-        log.warning("%s: its episodes were not drawn: %s", ledger.folder, error)
-    return sorted([*folder.glob("*.gif"), *folder.glob("*.png")])  # whole ones, also of a process that was ended
 
 
 def _whole_number(text: str) -> int:
