@@ -1,9 +1,9 @@
 """Hooks of MkDocs (mkdocs.yml): pages written for GitHub, as a site.
 
-A link from a page to a file of the repository outside `docs`, or to a folder, works on GitHub. Here such a file becomes a
-page of the site, under `source/`: Markdown as itself, everything else highlighted; a folder becomes a page that lists what
-is in it. Links are rewritten to lead there. And Markdown is read as GitHub reads it: lists and tables need no blank line
-before them, and lists within lists are indented by two spaces.
+A link from a page to a file of the repository outside `docs`, or to a folder, works on GitHub. Here such a file
+becomes a page of the site, under `source/`: Markdown as itself, everything else highlighted; a folder becomes a page
+that lists what is in it. Links are rewritten to lead there. And Markdown is read as GitHub reads it: lists and tables
+need no blank line before them, and lists within lists are indented by two spaces.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ ROOT: Final = Path(__file__).parents[1]
 DOCS: Final = "docs/"
 SOURCE: Final = "source/"  # where pages of files outside docs are on the site
 LANGUAGES: Final = {
-    ".py": "python", ".yaml": "yaml", ".toml": "toml", ".sh": "bash", ".sbatch": "bash", ".j2": "jinja", ".html": "html",
-    ".json": "json", ".csv": "text", ".txt": "text", ".in": "text",
+    ".py": "python", ".yaml": "yaml", ".toml": "toml", ".sh": "bash", ".sbatch": "bash", ".j2": "jinja",
+    ".html": "html", ".json": "json", ".csv": "text", ".txt": "text", ".in": "text",
 }  # fmt: skip
 LARGEST: Final = 200_000  # bytes of a file that is shown
 

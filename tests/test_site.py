@@ -1,15 +1,16 @@
 """The pages as a site, and what they tell people to type.
 
-Executed here, in one folder and with small budgets: the commands of docs/training.md that need neither Ray nor MLflow nor a
-module of one's own (train, go on, evaluate, export, report, instances), those of any page that plan or export a grid, and
-what lists or explains configs (`EXECUTED`). Python, YAML and commands of docs/python.md, docs/sb3.md and the three pages
-about what is one's own are executed by tests of their own (`ELSEWHERE`).
+Executed here, in one folder and with small budgets: the commands of docs/training.md that need neither Ray nor MLflow
+nor a module of one's own (train, go on, evaluate, export, report, instances), those of any page that plan or export a
+grid, and what lists or explains configs (`EXECUTED`). Python, YAML and commands of docs/python.md, docs/sb3.md and the
+three pages about what is one's own are executed by tests of their own (`ELSEWHERE`).
 
 Only parsed: all other commands of `space-dist`, `jobs/*.py` and `ray` that a block of README.md or docs/*.md has. Their
-sub-commands, options and types are checked by the command's own parser, files that begin with `configs/` or `jobs/` and
-names that begin with `shipped:` must exist, and what `--set` sets must be a key with such a value. Targets of `make` must
-exist. Words in capitals stand for something. Nothing is said of `pip`, `git`, `ssh`, pipes and loops around commands, nor of
-what commands print, but for the numbers of the quickstart (tests/test_quickstart.py) and the sentences of docs/faq.md.
+sub-commands, options and types are checked by the command's own parser, files that begin with `configs/` or `jobs/`
+and names that begin with `shipped:` must exist, and what `--set` sets must be a key with such a value. Targets of
+`make` must exist. Words in capitals stand for something. Nothing is said of `pip`, `git`, `ssh`, pipes and loops
+around commands, nor of what commands print, but for the numbers of the quickstart (tests/test_quickstart.py) and the
+sentences of docs/faq.md.
 """
 
 from __future__ import annotations
@@ -158,7 +159,11 @@ def parser(of: str) -> Any:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    sys.path.insert(0, str(ROOT / "jobs"))  # where a script finds what lies beside it
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.path[0]
     return typer.main.get_command(module.app)
 
 
@@ -169,7 +174,7 @@ def parsed(of: str, words: list[str]) -> dict[str, Any]:
     while hasattr(found, "commands"):
         name = arguments.pop(0)
         assert name in found.commands, f"there is no `{name}`; there are {sorted(found.commands)}"
-        context, found = type(found.make_context(of, [name]))(found, info_name=of, parent=context), found.commands[name]
+        context, found = found.context_class(found, info_name=of, parent=context), found.commands[name]
     return dict(found.make_context(words[0], arguments, parent=context).params)
 
 
@@ -235,7 +240,8 @@ def test_wrong_commands_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
         "recovery.md",
     }
     for words in (
-        "space-dist trian x", "space-dist train x --sed 1", "space-dist grid plan configs/grids/none.yaml", "make nothing",
+        "space-dist trian x", "space-dist train x --sed 1", "space-dist grid plan configs/grids/none.yaml",
+        "make nothing",
         "space-dist train configs/pointmass_space.yaml --set learner.gama=1", "ray start --haed",
         "python jobs/benchmark.py nothing", "ray job submit -- python jobs/train.py x --sed 1",
         "space-dist slurm export configs/grids/quickstart.yaml --out x --set tiem=1", "space-dist train x --seed many",
@@ -251,8 +257,8 @@ def test_cheap_commands_work_as_they_are_written(tmp_path: Path, monkeypatch: py
     small = [word for one in SMALL for word in ("--set", one)]
     assert command(monkeypatch, "train", "configs/pointmass_round_robin.yaml", *small) == 0  # which is reported on
     done = []
-    for line in dict.fromkeys(line.words for line in COMMANDS if executed(line)):
-        words = [str(tmp_path) + word if word.startswith("/shared") else word for word in line[1:]]
+    for place, line in enumerate(dict.fromkeys(line.words for line in COMMANDS if executed(line))):
+        words = [f"{tmp_path}/{place}{word}" if word.startswith("/shared") else word for word in line[1:]]
         code = command(monkeypatch, *words, *(small if words[0] == "train" else ()))
         assert code == 0, shlex.join(words)
         done.append(words[0])
@@ -289,8 +295,9 @@ def test_tests_that_execute_pages_name_them() -> None:
 @pytest.mark.parametrize(
     ("page", "text"), [(page.name, text) for page in PAGES for text in blocks(page, "yaml")], ids=lambda one: one[:20]
 )
-def test_yaml_of_a_page_is_taken_by_the_schema(page: str, text: str) -> None:
-    data = config.read_yaml(text, page)
+def test_yaml_of_a_page_is_taken_by_the_schema(page: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / "snippet.yaml").write_text(text)
+    data = config.read_yaml(tmp_path / "snippet.yaml")
     if "seeds" in data:
         config.check(GridConfig, data, page)
         return
