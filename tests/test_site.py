@@ -179,8 +179,8 @@ def parsed(of: str, words: list[str]) -> dict[str, Any]:
 
 
 def number(word: str) -> str:
-    """1 for what stands for a number: a capital, or a variable of the shell."""
-    return re.sub(r"^[A-Z]$|\$\{?\w+\}?", "1", word)
+    """A number for what may stand for one: a capital, or a variable of the shell."""
+    return re.sub(r"^[A-Z]$|\$\{?\w+\}?", "1024", word)
 
 
 def missing(words: list[str]) -> list[str]:
