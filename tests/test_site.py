@@ -180,7 +180,7 @@ def parsed(of: str, words: list[str]) -> dict[str, Any]:
 
 def number(word: str) -> str:
     """A number for what may stand for one: a capital, or a variable of the shell."""
-    return re.sub(r"^[A-Z]$|\$\{?\w+\}?", "1024", word)
+    return re.sub(r"^[A-Z]$|\$\{?\w+\}?", "4096", word)
 
 
 def missing(words: list[str]) -> list[str]:
@@ -311,7 +311,7 @@ def test_the_grid_of_the_page_has_the_cells_it_says(tmp_path: Path) -> None:
         text.replace("../pointmass_space.yaml", str(ROOT / "configs/pointmass_space.yaml"))
     )
     grid, bases = load_grid(tmp_path / "grid.yaml")
-    assert (len(list(grid.points())), len(bases), len(grid.seed_list)) == (15, 1, 10)
+    assert (len(list(grid.points())), len(bases), len(grid.seed_list())) == (15, 1, 10)
 
 
 # ---- errors ---------------------------------------------------------------------------------------------------------
