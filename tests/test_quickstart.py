@@ -1,4 +1,4 @@
-"""`make quickstart`, as a newcomer runs it, prints what README and docs say, to the digit, on every machine."""
+"""`make quickstart`, as a newcomer runs it, prints what docs say, to the digit, on every machine."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def test_the_quickstart_prints_the_published_numbers(empty_store: Path, tmp_path
     printed = re.findall(rf"^  (test return, IQM \[95 %\]: {NUMBERS} \(3/3\))$", done.stdout, re.MULTILINE)
     reached = re.findall(r"^(SPaCE's set reached all 100 instances in \d of 3 runs)", done.stdout, re.MULTILINE)
     assert (len(printed), len(reached)) == (2, 1)
-    readme, environments = ((ROOT / file).read_text() for file in ("README.md", "docs/environments.md"))
+    quickstart, environments = ((ROOT / file).read_text() for file in ("docs/index.md", "docs/environments.md"))
     for line in (*printed, *reached):
-        assert line in readme
+        assert line in quickstart
     for line in printed:
         assert re.findall(NUMBERS, line)[0] in environments
     assert reached[0] in environments
