@@ -342,10 +342,12 @@ def test_actors_are_started_where_slots_are_stepped_one_by_one(monkeypatch: pyte
     )
     assert cluster.n_workers(together, spec_of(together)) == 0
     spec = spec_of(one_by_one)
-    assert cluster.n_workers(one_by_one, spec) == 3
+    assert cluster.n_workers(one_by_one, spec) == 4
+    short = configs.load(ROOT / "configs/antgoal_space.yaml", ["budget.steps=99999"])
+    assert cluster.n_workers(short, spec) == 0
     monkeypatch.setattr(cluster, "cores", lambda: 1)
-    assert cluster.n_workers(one_by_one, spec) == 1
+    assert cluster.n_workers(one_by_one, spec) == 0
     told = configs.load(ROOT / "configs/antgoal_space.yaml", ["resources.workers=0"])
     assert cluster.n_workers(told, spec) == 0
     joined = configs.load(ROOT / "configs/pointmass_space.yaml", ["resources.address=auto"])
-    assert cluster.n_workers(joined, spec_of(joined)) == 1
+    assert cluster.n_workers(joined, spec_of(joined)) == 4

@@ -43,8 +43,8 @@ Seed = Annotated[int, typer.Option(help="The run's seed.")]
 
 _MODES = ("auto", "pool", "jobs")
 _WATCH_SECONDS = 1.0
-_QUEUE_SECONDS = 30.0
-_UNFINISHED = 3
+_QUEUE_SECONDS = 30.0  # between two questions to SLURM
+_UNFINISHED = 3  # the exit code of `grid status` where runs are still to be done
 
 
 @grid_app.command("plan")

@@ -25,6 +25,7 @@ _NEEDED: Final = (
     "matplotlib",
 )  # fmt: skip
 _LEAST_MB, _LEAST_FREE_MB = 2000, 1000  # of memory for a run with a Ray of its own; of disk for its files
+_NO_ANSWER = "no answer within"
 _SECONDS: Final = {"import": 60.0, "ray": 120.0, "command": 10.0, "server": 5.0}  # before a check is given up
 _START_RAY: Final = """
 from space_dist.system.workplace import private_ray
@@ -90,7 +91,7 @@ def versions() -> Iterator[Finding]:
         yield Finding("broken", f"{name} is not installed", f"pip install {name}")
     why = _failure("import stable_baselines3, sb3_contrib, numba, matplotlib, scipy")
     if why is not None:
-        yield Finding("broken", f"the libraries cannot be imported: {why}", "pip install --force-reinstall space-dist")
+        yield _not_imported("the libraries", why, "space-dist")
 
 
 def cores_and_memory() -> Iterator[Finding]:
@@ -160,7 +161,7 @@ def ray_works(*, start: bool) -> Iterator[Finding]:
             "note", "Ray is not installed: runs go in one process (--workers 0)", "pip install 'space-dist[ray]'"
         )
     elif (why := _failure("import ray")) is not None:
-        yield Finding("broken", f"Ray {version} cannot be imported: {why}", "pip install --force-reinstall 'ray'")
+        yield _not_imported(f"Ray {version}", why, "ray")
     elif not start:
         yield Finding("ok", f"Ray {version}")
     elif (why := _failure(_START_RAY, "ray")) is not None:
@@ -179,7 +180,7 @@ def mlflow_works(*, ask: bool) -> Iterator[Finding]:
         yield Finding("note", "MLflow is not installed: nothing is mirrored", "pip install 'space-dist[mlflow]'")
         return
     if (why := _failure("from mlflow import MlflowClient")) is not None:
-        yield Finding("broken", f"MLflow {version} cannot be imported: {why}", "pip install --force-reinstall mlflow")
+        yield _not_imported(f"MLflow {version}", why, "mlflow")
         return
     yield Finding("ok", f"MLflow {version}")
     uri = os.environ.get("MLFLOW_TRACKING_URI", "")
@@ -206,9 +207,7 @@ def bullet_works() -> Iterator[Finding]:
             "pip install 'space-dist[bullet]' (it has wheels for Python 3.11 and older)",
         )  # fmt: skip
     elif (why := _failure("import pybullet, pybullet_data")) is not None:
-        yield Finding(
-            "broken", f"PyBullet {version} cannot be imported: {why}", "pip install --force-reinstall pybullet"
-        )
+        yield _not_imported(f"PyBullet {version}", why, "pybullet")
     else:
         yield Finding("ok", f"PyBullet {version}")
 
@@ -243,6 +242,12 @@ def _version(distribution: str) -> str | None:
         return None
 
 
+def _not_imported(what: str, why: str, distribution: str) -> Finding:
+    if why.startswith(_NO_ANSWER):
+        return Finding("note", f"{what}: importing gave {why}", "try again when the machine and its disk are less busy")
+    return Finding("broken", f"{what} cannot be imported: {why}", f"pip install --force-reinstall {distribution}")
+
+
 def _failure(code: str, kind: Literal["import", "ray"] = "import") -> str | None:
     """Why Python fails at this, in a process of its own, which can crash and hang as it likes; None if it does not."""
     try:
@@ -250,7 +255,7 @@ def _failure(code: str, kind: Literal["import", "ray"] = "import") -> str | None
             [*PYTHON, "-c", code], capture_output=True, text=True, timeout=_SECONDS[kind], check=False
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return f"no answer within {_SECONDS[kind]:.0f} s"
+        return f"{_NO_ANSWER} {_SECONDS[kind]:.0f} s"
     except OSError as error:
         return str(error)
     if done.returncode == 0:

@@ -24,7 +24,7 @@ slurm_app = typer.Typer(no_args_is_help=True, help="The same grid as SLURM scrip
 Interface = Annotated[Optional[str], typer.Option()]  # noqa: UP045 - typer reads annotations at run time
 
 _MODES = ("array", "cluster")
-_SECONDS = 60.0
+_SECONDS = 60.0  # for sbatch, which waits for a busy controller
 
 
 @slurm_app.command("export")

@@ -18,11 +18,11 @@ from space_dist.config.quoting import clean, short
 from space_dist.config.sections import MAX_LIST
 from space_dist.errors import ConfigError, nearest
 
-_MAX_CONFIG_BYTES = 64 << 10
+_MAX_CONFIG_BYTES = 64 << 10  # over twenty times the longest that ships
 _MAX_ALIASES = 20  # each may double what a file means
 _MAX_WORD = 100  # characters of a key
 _MAX_BRACKETS = 200  # open at once
-_MAX_NESTING = 50
+_MAX_NESTING = 50  # the parser is recursive, and so is the check against the schema
 
 
 def to_yaml(data: Mapping[str, Any]) -> str:

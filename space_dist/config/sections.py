@@ -13,7 +13,7 @@ from space_dist.system.importing import why_refused
 MAX_LIST = 10_000  # values of a list in a config
 Sink = Literal["tensorboard", "wandb"]
 SINKS: tuple[Sink, ...] = get_args(Sink)
-_MAX_WORKERS = 4096
+_MAX_WORKERS = 4096  # as many as there may be shards
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
@@ -205,9 +205,9 @@ class ResourcesConfig(Patience):
     """What the run may use. Decides no result."""
 
     workers: int | Literal["auto"] = Field(default="auto")
-    """Ray rollout actors; 0: everything in this process, without Ray. auto: 0 where the environment steps all slots at
-    once, compiled or in NumPy, so that actors gain nothing; else one for each CPU but one, and for each shard, at
-    most."""
+    """Ray rollout actors; 0: everything in this process, without Ray. auto: of a Ray of its own, one for
+    each CPU and shard at most, where slots are stepped one by one (single environments, PyBullet) and the budget is
+    100,000 steps or more; else 0, as actors would gain nothing. In a cluster: one for each shard."""
     address: str = Field(default="local", min_length=1, max_length=300)
     """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)

@@ -24,7 +24,7 @@ from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.seeding import Purpose, generator, seed_sequence
 
 FEWEST_POINTS = 5  # with no more than these in the history, absolute learning progress is 0 (the authors' code)
-FEWEST_COMPONENTS = 2
+FEWEST_COMPONENTS = 2  # of the mixtures that AIC chooses from (the authors' code)
 
 
 @dataclass(frozen=True)

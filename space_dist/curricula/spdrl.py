@@ -36,12 +36,12 @@ from space_dist.curricula.interface import (
 from space_dist.instances import ContextBounds
 from space_dist.seeding import Purpose, generator
 
-LARGEST_ALPHA = 1e5
+LARGEST_ALPHA = 1e5  # the published code's: at the target the divergence is 0, and alpha would be no number
 SMALLEST_KL = 1e-10  # what alpha is divided by at least
 _LARGEST_LOG_RATIO = 50.0  # of densities; far outside any trust region
 _GTOL, _XTOL = 1e-4, 1e-6  # of trust-constr, as in the published code
 _FIRST_RADII = (1.0, 0.1, 0.01)  # of trust-constr; SciPy's own, and what is tried where that led nowhere
-_CG_STEPS = 10
+_CG_STEPS = 10  # iterations for a direction, at most
 _LINE_SEARCH_STEPS, _SHRINK = 20, 0.8
 
 Optimiser = Literal["trust_constr", "conjugate_gradient"]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from space_dist.envs.interface import Distribution, IntArray, Step
 from space_dist.instances import ContextBounds
 
+# Gymnasium's constants, in SI units: tests/test_cartpole.py holds every step against its own.
 GRAVITY = 9.8
 CART_MASS = 1.0
 POLE_MASS = 0.1
@@ -24,8 +25,8 @@ FORCE = 10.0
 TAU = 0.02  # seconds per Euler step
 X_LIMIT = 2.4
 ANGLE_LIMIT = 12 * 2 * math.pi / 360
-START_LIMIT = 0.05
-HORIZON = 200
+START_LIMIT = 0.05  # of each of the four numbers of a state
+HORIZON = 200  # CartPole-v0's, as in the paper; v1 has 500
 
 BOUNDS: Final = ContextBounds(names=("length",), low=np.array([0.1]), high=np.array([1.0]))
 """CartPole: *half* the pole's length in metres, as Gymnasium's `length` is. The bounds are ours.

@@ -20,13 +20,13 @@ DT = 0.01  # seconds per inner step
 INNER_STEPS = 10  # physics steps per action
 FORCE = 1.5  # acceleration per unit of action
 NOISE_STD = 0.05  # of the acceleration, per inner step and axis
-ACTION_LIMIT = 10.0
-POSITION_LIMIT = 4.0
+ACTION_LIMIT = 10.0  # on each axis
+POSITION_LIMIT = 4.0  # walls of the room, left, right, above and below
 START = np.array([0.0, 0.0, 3.0, 0.0])  # x, vx, y, vy
 GOAL = np.array([0.0, -3.0])
-SUCCESS_DISTANCE = 0.25
+SUCCESS_DISTANCE = 0.25  # from the goal
 REWARD_DECAY = 0.6  # per unit of distance to the goal
-HORIZON = 100
+HORIZON = 100  # actions; the paper, appendix A
 
 BOUNDS: Final = ContextBounds(
     names=("gate_x", "gate_width", "friction"),

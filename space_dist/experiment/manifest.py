@@ -30,10 +30,10 @@ from space_dist.system.files import atomic_write
 
 FORMAT = 1
 MANIFEST = "manifest.json"
-CELL_ID_DIGITS = 12
-MAX_RUNS = 100_000
+CELL_ID_DIGITS = 12  # 48 bits: among 10,000 cells two are alike once in five million grids, and are refused
+MAX_RUNS = 100_000  # a folder each; a typing error in a range makes millions
 _MAX_MANIFEST_BYTES = 512 << 20
-_MAX_LABEL = 120
+_MAX_LABEL = 120  # characters; what is cut is told apart by the id
 _CELL_ID = re.compile(rf"[0-9a-f]{{{CELL_ID_DIGITS}}}")
 _NOT_OF_A_GRID = {
     "seed": "seeds",

@@ -33,9 +33,9 @@ log = logging.getLogger("space_dist")
 
 STOP_ASKED = "the grid's file `stop`"
 _TICK_SECONDS = 0.2
-_ELSEWHERE_SECONDS = 2.0
+_ELSEWHERE_SECONDS = 2.0  # between two looks at the files of runs that others are at
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
-_FINAL_PUSH_SECONDS = 300.0
+_FINAL_PUSH_SECONDS = 300.0  # of a whole grid: its last rows and its report
 _FREEZE_SECONDS = 120.0  # for others who freeze it at this moment
 _ABANDONED_SECONDS = 5.0  # after the grace time of a run whose supervisor is gone
 _LIBRARIES_MB = 700  # of a process that trains, before it has a run

@@ -45,11 +45,11 @@ Mode = Literal["auto", "pool", "jobs"]
 LONG_SECONDS = 300.0  # runs expected to take longer get a job each
 STEPS_PER_SECOND = 4_000.0  # of a run whose speed nobody has measured yet: PPO on PointMass, one core
 _POLL_SECONDS = 1.0
-_NODES_SECONDS = 180.0
-_AGENT_SECONDS = 60.0
+_NODES_SECONDS = 180.0  # for a batch system's nodes to join: they are granted together, and begin one by one
+_AGENT_SECONDS = 60.0  # for the agent that starts jobs, which comes up after Ray itself
 _LATE_SECONDS = 60.0  # without a sign of life of its supervisor a job is taken for lost
 _LIVE = (JobStatus.PENDING, JobStatus.RUNNING)
-_MAX_JOB_NAME = 60
+_MAX_JOB_NAME = 60  # characters of a grid's name in its job's, which people read in lists
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------------

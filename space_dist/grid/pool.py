@@ -34,11 +34,11 @@ from space_dist.ledger import believed_alive, this_process
 
 log = logging.getLogger("space_dist")
 
-_SIGN_SECONDS = 2.0
+_SIGN_SECONDS = 2.0  # between two questions to a worker whether it is there
 _LATE_SECONDS = 30.0  # without an answer a worker is taken for lost
-_START_SECONDS = 120.0
+_START_SECONDS = 120.0  # for the first worker: a cluster that others fill says so instead of waiting for ever
 _NONCE = ".nonce-"
-_FORGOTTEN_SECONDS = 86_400.0
+_FORGOTTEN_SECONDS = 86_400.0  # after which a nonce is nobody's, though its process cannot be seen from here
 
 
 class PoolWorker:

@@ -24,7 +24,7 @@ COMPILES = not numba.config.DISABLE_JIT
 """Whether Numba was left to compile when these functions were defined. Else they stay Python's, which runs none."""
 
 F = TypeVar("F", bound=Callable[..., Any])
-BYTES = 64
+BYTES = 64  # of a vector: one of AVX-512's registers, two of AVX2's, and a cache line
 # Nothing here allocates, and nothing but what is compiled calls it: reference counts and wrappers cost compile time.
 _OPTIONS = {
     "boundscheck": False, "error_model": "numpy", "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,

@@ -33,14 +33,11 @@ from space_dist.rollout import Shard
 from space_dist.seeding import Purpose, global_seeds
 
 # What a member takes, measured (tests/test_population.py holds it against the memory of a process).
-_ROLLOUT_COPIES, _WAITING_COPIES, _PER_STEP = (
-    10,
-    4,
-    8,
-)  # numbers beside observation and action: reward, value, advantage, ...
+_ROLLOUT_COPIES, _WAITING_COPIES = 10, 4
+_PER_STEP = 8  # numbers beside observation and action: reward, value, advantage, ...
 _TRPO_KEPT, _PPO_KEPT = 5, 6  # times the units of all layers
 _PARAMETER_COPIES = 10
-_OBJECTS_BYTES = 1 << 20
+_OBJECTS_BYTES = 1 << 20  # Python's own: the run, its curriculum, its ledger
 _NUMBER_BYTES = 4
 
 Array = NDArray[np.float32]

@@ -17,7 +17,7 @@ from space_dist.errors import RunLockedError
 from space_dist.system.files import locked, read_file
 
 LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
-HEARTBEAT_SECONDS = 10.0
+HEARTBEAT_SECONDS = 10.0  # between signs of an owner: a dozen may be lost before the lease is over
 CLAIM_SECONDS = 10.0  # for a lock that another process holds; it does so while it writes
 OWNER_SECONDS = 60.0  # the same for the owner, whose run ends then
 _MAX_OWNER_BYTES = 1 << 20

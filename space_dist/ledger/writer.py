@@ -33,7 +33,7 @@ from space_dist.ledger.rows import ROW_FILES, Row, encode_row
 from space_dist.system.files import TEMPORARIES, appending, atomic_write, read_file, why_not_own
 
 log = logging.getLogger("space_dist")
-KEPT_CHECKPOINTS = 2
+KEPT_CHECKPOINTS = 2  # one more than is needed: the newest may turn out to be damaged
 
 
 class RunWriter:

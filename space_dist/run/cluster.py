@@ -21,6 +21,7 @@ from space_dist.rollout import FloatArray, IntArray, Outcomes, Setup, Split, Wor
 from space_dist.rollout.walk import Walk
 from space_dist.system.workplace import cores
 
+_WORTH_RAY = 100_000  # environment steps: at some thousand a second, several times what it takes to start Ray
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
 
@@ -101,9 +102,10 @@ def n_workers(config: RunConfig, spec: EnvironmentSpec) -> int:
     resources = config.resources
     if isinstance(resources.workers, int):
         return resources.workers
-    if resources.address == "local" and not spec.one_by_one:
-        return 0
-    return max(1, min(config.rollout.shards, cores() - 1))
+    if resources.address != "local":
+        return config.rollout.shards
+    most = min(config.rollout.shards, cores())  # the run's own process waits while they collect
+    return most if spec.one_by_one and most > 1 and config.budget.steps >= _WORTH_RAY else 0
 
 
 class CurriculumHost:

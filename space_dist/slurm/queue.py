@@ -13,7 +13,7 @@ from typing import Any
 from space_dist.config import clean
 from space_dist.slurm.export import JOBS
 
-_SECONDS = 20.0
+_SECONDS = 20.0  # for squeue and sacct, whose controller may be busy or gone
 _MAX_BYTES = 1 << 20
 
 
