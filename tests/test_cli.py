@@ -212,7 +212,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert len(done.stdout.splitlines()) <= 5  # of progress little where nobody looks on
+    waited, first, *others, last, ended = done.stdout.splitlines()
+    assert waited.endswith(": preparing the learner")
+    assert "256/4,096 steps" in first
+    assert "4,096/4,096 steps" in last
+    assert ended.endswith(f"environment steps. {folder}")
+    assert all("/4,096 steps" in line for line in others)  # now and then
     return folder
 
 

@@ -59,31 +59,31 @@ def metrics(grid: Grid, runs: list[Run]) -> list[bytes]:
     return [(grid.ledger(run).folder / METRICS).read_bytes() for run in runs]
 
 
-def test_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_path: Path) -> None:
-    path = write_grid(tmp_path, seeds=[0])
+def test_six_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_path: Path) -> None:
+    path = write_grid(tmp_path, seeds={"count": 3})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", "jobs")
     both = [start(cluster, *submit) for _ in range(2)]
     said = [process.communicate(timeout=PATIENCE)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
-    assert all("small: 2 of 2 runs done" in text for text in said)
+    assert all("small: 6 of 6 runs done" in text for text in said)
     grid = Grid(tmp_path / "runs/small")
     runs = grid.manifest().runs()
-    assert begun(grid, runs) == [1] * 2
+    assert begun(grid, runs) == [1] * 6
     jobs = [job for job in cluster.ask("/api/jobs/") if (job["metadata"] or {}).get("folder") == str(grid.folder)]
     assert sorted(job["submission_id"] for job in jobs) == sorted(f"small-{run.cell.id}-s{run.seed}-a1" for run in runs)
     assert {job["metadata"]["code"] for job in jobs} == {grid.manifest().code}
     assert all("/" not in job["submission_id"] for job in jobs)
     before = metrics(grid, runs)
     again = start(cluster, *submit)
-    assert "2 of 2 runs done" in again.communicate(timeout=PATIENCE)[0]
+    assert "6 of 6 runs done" in again.communicate(timeout=PATIENCE)[0]
     assert again.returncode == 0
-    assert begun(grid, runs) == [1] * 2
+    assert begun(grid, runs) == [1] * 6
     assert metrics(grid, runs) == before
     for number, run in enumerate(runs):
         alone = launch(stored_config(grid.ledger(run)), tmp_path / f"alone{number}", resume=False, stop=StopRequests())
         assert (alone.ledger.folder / METRICS).read_bytes() == before[number]
     status = start(cluster, "grid", "status", grid.folder, "--json")
-    assert json.loads(status.communicate(timeout=PATIENCE)[0])["counts"] == {"done": 2}
+    assert json.loads(status.communicate(timeout=PATIENCE)[0])["counts"] == {"done": 6}
     assert status.returncode == 0
 
 

@@ -109,7 +109,8 @@ def test_interrupted_after_every_round_and_resumed_it_is_the_same(
 @pytest.mark.usefixtures("one_ray")
 @pytest.mark.parametrize(
     ("kind", "workers"),
-    [("spdrl", 4), ("vds", 2), ("alp_gmm", 2), ("plr", 1), ("learnability", 2), ("manual", 2)],
+    [("spdrl", 1), ("spdrl", 4), ("uniform", 1), ("vds", 2), ("alp_gmm", 2), ("plr", 1), ("learnability", 2),
+     ("manual", 2)],
 )  # fmt: skip
 def test_the_number_of_workers_changes_no_byte(
     kind: str, workers: int, folder: Path, reference: Any, tmp_path: Path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -37,8 +38,11 @@ def emulator() -> str | None:
 needs_emulator = pytest.mark.skipif(emulator() is None, reason="qemu-user 8 or newer is not installed")
 
 
-# The kernels are compiled once, for any CPU with AVX2 and FMA, and here: under an emulator it would take minutes.
-_TARGET = {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": "+avx2,+fma"}
+_TARGET = """
+import json, llvmlite.binding as llvm
+features = llvm.get_host_cpu_features().flatten()
+print(json.dumps({"NUMBA_CPU_NAME": llvm.get_host_cpu_name(), "NUMBA_CPU_FEATURES": features}))
+"""
 _COMPILE = """
 import numpy as np
 from space_dist.kernels import dqn, ppo, sac, td3
@@ -55,13 +59,18 @@ def _run(command: list[str], environment: dict[str, str] | None = None) -> str:
     return done.stdout
 
 
-def _environment() -> dict[str, str]:
-    """The environment of what is emulated, for which the kernels have been compiled by then."""
+@functools.cache
+def _environment(cpu: str) -> dict[str, str]:
+    """The environment of what is emulated: the kernels have been compiled here for the CPU that `cpu` says it is.
+
+    Compiling under an emulator takes minutes, and is the same work: only what is compiled runs on the CPU.
+    """
+    target = json.loads(_run([emulator() or "", "-cpu", cpu, sys.executable, "-c", _TARGET]))
     # Kept from one run of the tests to the next, as pytest's own folders are not.
     folder = Path(tempfile.gettempdir()) / f"space-dist-golden-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     # MiB for what is translated: 128 are full with torch and a few runs, and then all is translated again.
-    environment = dict(os.environ) | _TARGET | {"NUMBA_CACHE_DIR": str(folder), "QEMU_TB_SIZE": "1024"}
+    environment = dict(os.environ) | target | {"NUMBA_CACHE_DIR": str(folder), "QEMU_TB_SIZE": "1024"}
     _run([sys.executable, "-c", _COMPILE], environment)
     return environment
 
@@ -91,5 +100,5 @@ def emulate(cpu: str, folder: Path) -> Emulated:
         launch(config, run, resume=False, stop=Stop())
     stopped = Ledger(run).status()
     command = [emulator() or "", "-cpu", cpu, sys.executable, "-m", "tests.golden", "--resume", str(run)]
-    printed = json.loads(_run(command, _environment()).splitlines()[-1])
+    printed = json.loads(_run(command, _environment(cpu)).splitlines()[-1])
     return Emulated(printed, stopped, Ledger(run).status(), digests_of(run))
