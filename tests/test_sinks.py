@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import struct
+import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,9 +17,11 @@ from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import GridTracking
 from space_dist.ledger import Ledger, RunWriter
 from space_dist.report import read_config
-from space_dist.tracking import sync
+from space_dist.tracking import sync, wandb
 from space_dist.tracking.settling import settled
 from space_dist.tracking.sinks import read_synced, refuse_missing
+from space_dist.tracking.wandb import records
+from tests.patience import PATIENCE
 from tests.test_grid_tracking import make_grid, run_to
 from tests.test_report import GROWTH, continue_run, start_run
 from tests.test_tracking import contents
@@ -131,25 +132,36 @@ def test_weights_and_biases_has_a_run_once_it_rests(tmp_path: Path) -> None:
 
 
 def history(path: Path) -> list[dict[str, float]]:
-    """The rows of an offline run: records in blocks of 32 KiB, as in LevelDB's log, each a message of W&B's."""
-    from wandb.proto import wandb_internal_pb2
+    """The rows of an offline run."""
+    return [
+        {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in content.item}
+        for kind, content in records(path)
+        if kind == "history"
+    ]
 
-    content, place, message, rows = path.read_bytes(), 7, b"", list[dict[str, float]]()
-    while place + 7 <= len(content):
-        if (room := -place % 32768) < 7 and room:
-            place += room
-            continue
-        _, length, kind = struct.unpack_from("<IHB", content, place)
-        message += content[place + 7 : place + 7 + length]
-        place += 7 + length
-        if kind in (1, 4):  # whole, or its last part
-            record: Any = wandb_internal_pb2.Record()
-            record.ParseFromString(message)
-            message = b""
-            if record.WhichOneof("record_type") == "history":
-                items = record.history.item
-                rows.append({item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items})
-    return rows
+
+def test_a_run_that_weights_and_biases_has_not_written_yet_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("wandb")
+    ledger = showing(start_run(tmp_path / "run"), "wandb")
+    continue_run(ledger, TEST, GROWTH)
+    sync([ledger])
+    (written,) = (ledger.folder / "wandb").glob("offline-run-*/*.wandb")
+    whole = written.read_bytes()
+    late = tmp_path / "late/wandb/offline-run-1/run-1.wandb"
+    late.parent.mkdir(parents=True)
+    for size in (7, 100, len(whole) // 2):  # its header, and parts
+        late.write_bytes(whole[:size])
+        monkeypatch.setattr(wandb, "_PATIENCE", 0.05)
+        with pytest.raises(OSError, match="has not written its run within"):
+            wandb.await_exit(tmp_path / "late")
+    writer = threading.Timer(0.05, late.write_bytes, [whole])
+    monkeypatch.setattr(wandb, "_PATIENCE", PATIENCE)
+    writer.start()
+    wandb.await_exit(tmp_path / "late")
+    writer.join()
+    assert late.read_bytes() == whole
 
 
 def test_a_missing_package_is_a_sentence_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

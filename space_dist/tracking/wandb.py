@@ -7,7 +7,10 @@ interrupted. `wandb sync` of the folder `offline-run-...` uploads it, under the 
 from __future__ import annotations
 
 import shutil
+import struct
 import tempfile
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +19,10 @@ from space_dist.tracking.snapshot import NOTE_TAG, Record
 
 FOLDER: Final = "wandb"
 _PROJECT: Final = "space_dist"
+_PATIENCE: Final = 60.0  # seconds for W&B's own process to write what it was given
+_HEADER: Final = 7  # bytes, of a file and of each of its records
+_BLOCK: Final = 32768  # bytes
+_WHOLE_OR_LAST: Final = (1, 4)  # kinds of records: whole, first, middle, last part of one
 
 
 class WeightsAndBiases:
@@ -69,3 +76,37 @@ class WeightsAndBiases:
                 run.log({**numbers, "steps": step, "time/unix": milliseconds / 1000.0})
         finally:
             run.finish(exit_code=0 if record.mlflow_status == "FINISHED" else 1)
+        await_exit(folder)
+
+
+def await_exit(folder: Path) -> None:
+    """Wait until the run in `folder` is on disk: `finish` only tells W&B's process to. Raises OSError if late."""
+    deadline = time.monotonic() + _PATIENCE
+    while not any(kind == "exit" for path in folder.glob("wandb/offline-run-*/*.wandb") for kind, _ in records(path)):
+        if time.monotonic() > deadline:
+            raise OSError(f"Weights & Biases has not written its run within {_PATIENCE:g} s")
+        time.sleep(0.01)
+
+
+def records(path: Path) -> Iterator[tuple[str, Any]]:
+    """Kind and content of each record of an offline run's file, as far as it is written.
+
+    They are parts in blocks of 32 KiB, as in LevelDB's log, that make messages of W&B's.
+    """
+    from wandb.proto import wandb_internal_pb2
+
+    messages: Any = wandb_internal_pb2  # makes its classes as it is imported
+    content, place, message = path.read_bytes(), _HEADER, b""
+    while place + _HEADER <= len(content):
+        if (room := -place % _BLOCK) < _HEADER and room:
+            place += room
+            continue
+        _, length, part = struct.unpack_from("<IHB", content, place)
+        if (place := place + _HEADER + length) > len(content):
+            return
+        message += content[place - length : place]
+        if part in _WHOLE_OR_LAST:
+            record = messages.Record()
+            record.ParseFromString(message)
+            message, kind = b"", record.WhichOneof("record_type")
+            yield kind, getattr(record, kind)
