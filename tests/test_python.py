@@ -24,7 +24,7 @@ from space_dist.api.training import as_config
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.grid.planning import plan
-from space_dist.ledger import CURRICULUM, METRICS
+from space_dist.ledger import CURRICULUM, METRICS, RunWriter
 from space_dist.run.training import Progress
 from tests.commanding import command
 from tests.patience import PATIENCE
@@ -102,6 +102,29 @@ def test_a_longer_run_that_is_interrupted_goes_on(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         space_dist.train(long, out=tmp_path / "run", resume=True, progress=give_up)
     assert space_dist.Run(tmp_path / "run").status.state == "interrupted"
+    space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    space_dist.train(long, out=tmp_path / "whole", progress=False)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+def test_killed_as_it_is_handed_to_a_larger_budget_it_goes_on_under_that_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = learner_section("ppo")
+    short, long = config_for(tmp_path, section), config_for(tmp_path, section, budget={"steps": 12 * N_STEPS})
+    space_dist.train(short, out=tmp_path / "run", progress=False)
+    hand_over = RunWriter.hand_over
+
+    def die_behind(writer: RunWriter, *arguments: Any) -> Any:
+        hand_over(writer, *arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunWriter, "hand_over", die_behind)
+    with pytest.raises(KeyboardInterrupt):
+        space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match="a larger budget, of 480 steps, when it was killed: ask for"):
+        space_dist.train(short, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "whole", progress=False)
     assert files(tmp_path / "run") == files(tmp_path / "whole")

@@ -213,7 +213,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         )  # fmt: skip
     stored = configs.dump(_self_contained(config))
     if shorter is not None:
-        now_at = writer.hand_over(status, within(shorter, blueprint.spec.horizon))
+        now_at = writer.hand_over(status, stored, within(shorter, blueprint.spec.horizon))
         status = replace(status, steps=now_at.steps, round=now_at.round)
         log.info("going on under a larger budget, from round %d", status.round)
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
@@ -289,7 +289,12 @@ def _refuse_other_run(
         ) from error
     digests = train.digest(), test.digest()
     if identity == configs.identity(stored, *digests, weights=learned):
-        return None
+        if before is not None and len(before.files.get(ledger.config.name, [])) > 1:
+            raise ConfigError(
+                f"{ledger.folder} had been asked to go on under a larger budget, of {before.budget_steps:,} steps, "
+                "when it was killed: ask for that budget again"
+            )
+        return None  # an earlier version's identity
     longer = stored.model_copy(update={"budget": config.budget})
     if identity == configs.identity(longer, *digests, weights=learned) and is_longer(stored, config):
         return stored
