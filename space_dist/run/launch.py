@@ -59,11 +59,12 @@ _FINAL_PUSH_SECONDS = 45.0  # for all of it: a server that answers badly (20 s a
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a launch ended: the run's ledger, whether it was done before, and what MLflow's mirror lacks, if anything."""
+    """How a launch ended: the run's ledger, whether it was done before, what MLflow's mirror lacks, and its pages."""
 
     ledger: Ledger
     already_done: bool = False
     tracking_warning: str | None = None
+    pages: tuple[str, ...] = ()
 
 
 def launch(
@@ -124,8 +125,10 @@ class ActiveRun:
 
     def finished(self) -> Outcome:
         """How it ended, once MLflow's mirror has what it can have."""
-        warning = None if self.pusher is None else self.pusher.warning(_FINAL_PUSH_SECONDS, "run")
-        return replace(self.outcome, tracking_warning=warning)
+        if self.pusher is None:
+            return self.outcome
+        warning = self.pusher.warning(_FINAL_PUSH_SECONDS, "run")
+        return replace(self.outcome, tracking_warning=warning, pages=tuple(self.pusher.pages()))
 
 
 @contextlib.contextmanager
