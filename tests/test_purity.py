@@ -30,9 +30,18 @@ def test_importing_it_imports_nothing_heavy(module: str):
     assert not imported.intersection(HEAVY)
 
 
-@pytest.mark.parametrize("module", ["space_dist.grid.jobs", "space_dist.grid.supervisor", "space_dist.slurm"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "space_dist.grid.jobs",
+        "space_dist.grid.supervisor",
+        "space_dist.slurm",
+        "space_dist.api.grids",
+        "space_dist.cli.grids",
+    ],
+)
 def test_whoever_only_starts_runs_does_not_wait_for_torch(module: str):
-    assert not imported_with(module).intersection({"torch", "mlflow", "stable_baselines3", "sb3_contrib"})
+    assert not imported_with(module).intersection({"torch", "mlflow", "stable_baselines3", "sb3_contrib", "matplotlib"})
 
 
 def test_the_curricula_need_no_environment_either():
