@@ -13,6 +13,8 @@ import space_dist  # noqa: F401 # isort: skip - its settings come before NumPy i
 import pytest
 from hypothesis import settings
 
+from space_dist.system.processes import collect_seldom
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"):
@@ -38,6 +40,7 @@ def _keep_folders_in_memory() -> None:
 
 
 _keep_folders_in_memory()
+collect_seldom()
 
 
 # Files that take longest, from the longest on: minutes of waiting, of emulating, or of both.
