@@ -13,6 +13,8 @@ import space_dist  # noqa: F401 # isort: skip - its settings come before NumPy i
 import pytest
 from hypothesis import settings
 
+pytest.register_assert_rewrite("tests.own_code")  # whose asserts are to show what they compared, as tests' do
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"):
