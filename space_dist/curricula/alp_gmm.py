@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from space_dist.curricula.draws import Draws, distinct
+from space_dist.curricula.draws import Draws, distinct, mean_values, needed_episodes
 from space_dist.curricula.interface import (
     GENERATED,
     BoolArray,
@@ -77,9 +77,7 @@ class AlpGmm(Curriculum):
 
     def step(self, state: MixtureState, feedback: Feedback) -> tuple[MixtureState, Selection, Numbers]:
         """Take in the finished episodes one by one; fit where `fit_rate` of them are complete."""
-        episodes = feedback.episodes
-        if episodes is None:
-            raise ValueError("ALP-GMM needs the iteration's episodes")
+        episodes = needed_episodes(feedback, "ALP-GMM")
         contexts, returns = state.contexts, state.returns
         recent, means, covariances = state.recent, state.means, state.covariances
         count = state.episodes
@@ -99,8 +97,7 @@ class AlpGmm(Curriculum):
         new = MixtureState(state.version + 1, contexts, returns, recent, count, means, covariances)
         numbers: Numbers = {
             "size": distinct(feedback) if self._from_set else len(episodes.indices),
-            "mean_value_before": float(np.abs(feedback.values_before).mean()),
-            "mean_value_after": float(np.abs(feedback.values_after).mean()),
+            **mean_values(feedback),
             "finished_episodes": count,
             "fitted": fit_rows is not None,
             "components": len(means),
