@@ -56,7 +56,7 @@ class Example:
 
     @contextlib.contextmanager
     def laid_out(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-        """The current folder is one that holds what the page shows, and instances."""
+        """The current folder is one that holds what the page shows, and instances; a test may add a module `others`."""
         (code,), (config,) = self.blocks("python"), self.blocks("yaml")
         monkeypatch.chdir(folder)
         monkeypatch.syspath_prepend(str(folder))
@@ -66,7 +66,8 @@ class Example:
         sample = self.blocks("bash")[0].splitlines()[0].split()[1:]
         assert command(monkeypatch, *sample, "--train", 12, "--test", 3) == 0
         yield
-        sys.modules.pop(self.name, None)
+        for module in (self.name, "others"):
+            sys.modules.pop(module, None)
 
     def chosen(self, *settings: str, workers: int = 0) -> configs.RunConfig:
         return configs.load(self.config, [*self.quick, f"resources.workers={workers}", *settings])
@@ -111,6 +112,13 @@ class Example:
         launch(self.chosen(), folder / "run", resume=True, stop=StopRequests())
         assert Ledger(folder / "run").status().fingerprint_changed
         assert "that of your own environment, policy, learner or curriculum" in (folder / "run/log.txt").read_text()
+
+
+@pytest.fixture
+def example(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A current folder that holds the `EXAMPLE` of the test's module, and instances."""
+    with request.module.EXAMPLE.laid_out(tmp_path, monkeypatch):
+        yield tmp_path
 
 
 def _slowly(folder: str) -> None:

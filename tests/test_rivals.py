@@ -40,7 +40,7 @@ from space_dist.curricula.plr import LevelReplay, ReplayState, replay_chances, r
 from space_dist.curricula.vds import ValueDisagreement, disagreement
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
-from space_dist.instances import ContextBounds, InstanceSet, read_csv
+from space_dist.instances import InstanceSet, read_csv
 from space_dist.learner import Ensemble, make_learner
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout import Setup, Shard, Worker
@@ -52,10 +52,10 @@ from space_dist.run.launch import launch
 from space_dist.seeding import Purpose, generator
 from space_dist.system.interrupts import StopRequests
 from tests.tiny_env import Line
+from tests.two_features import BOUNDS, scattered
 
 ROOT = Path(__file__).resolve().parent.parent
 SPACE = ROOT / "configs/pointmass_space.yaml"
-BOUNDS = ContextBounds(("a", "b"), np.array([0.0, -10.0]), np.array([2.0, 10.0]))
 
 
 def instances(n: int, **columns: Any) -> InstanceSet:
@@ -715,9 +715,7 @@ KINDS = {
 
 
 def wide(n: int = 6) -> InstanceSet:
-    """Instances that vary in every direction, so that their covariance is not singular."""
-    contexts = np.random.default_rng(3).uniform(BOUNDS.low, BOUNDS.high, size=(n, 2))
-    return InstanceSet(np.arange(n), contexts, BOUNDS.names, {"effort": np.arange(n, 0.0, -1.0)})
+    return scattered(n, effort=np.arange(n, 0.0, -1.0))
 
 
 def driven(curriculum: Curriculum, train: InstanceSet, steps: int = 4, through: Callable[[State], State] | None = None):

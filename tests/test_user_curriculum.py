@@ -1,9 +1,9 @@
 """Anyone's own curriculum, by import path: the example in the documentation, the same bytes wherever it is made."""
 
+# ruff: noqa: F811 - a fixture that is imported
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
-from tests.own_code import Example
+from tests.own_code import Example, example  # noqa: F401
 
 EXAMPLE = Example(
     "your_curriculum.md", "my_curriculum", rounds=16,
@@ -22,13 +22,6 @@ EXAMPLE = Example(
            "checkpoint.every_rounds=1", "tracking.uri=null"),
 )  # fmt: skip
 chosen, trained = EXAMPLE.chosen, EXAMPLE.trained
-
-
-@pytest.fixture
-def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A current folder that holds what the documentation shows, and instances."""
-    with EXAMPLE.laid_out(tmp_path, monkeypatch):
-        yield tmp_path
 
 
 def test_the_example_in_the_documentation_is_short_and_works(

@@ -1,10 +1,10 @@
 """Anyone's own learner, by import path: the example in the documentation, the same bytes wherever it goes on."""
 
+# ruff: noqa: F811 - a fixture that is imported
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from space_dist.run.launch import launch
 from space_dist.sb3.export import export_sb3
 from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
-from tests.own_code import Example
+from tests.own_code import Example, example  # noqa: F401
 from tests.test_learners import RESULTS, interrupted, results
 
 EXAMPLE = Example(
@@ -30,14 +30,6 @@ EXAMPLE = Example(
 chosen, trained = EXAMPLE.chosen, EXAMPLE.trained
 OFF_POLICY = ["budget.steps=1024", "evaluation.every_steps=1024", "checkpoint.every_rounds=1", "tracking.uri=null",
               "resources.workers=0"]  # fmt: skip
-
-
-@pytest.fixture
-def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A current folder that holds what the documentation shows, and instances."""
-    with EXAMPLE.laid_out(tmp_path, monkeypatch):
-        yield tmp_path
-    sys.modules.pop("others", None)
 
 
 def written(folder: Path, code: str) -> None:
