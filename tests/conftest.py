@@ -15,7 +15,7 @@ import pytest
 from hypothesis import settings
 
 # Their asserts show what they compared, as those of test modules do.
-pytest.register_assert_rewrite("tests.golden.on_another_cpu", "tests.own_code")
+pytest.register_assert_rewrite("tests.golden.on_another_cpu", "tests.own_code", "tests.three_rounds")
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
