@@ -9,13 +9,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from space_dist.api.grids import frozen
 from space_dist.cli.grids import run_frozen
 from space_dist.cli.overview import tell
 from space_dist.cli.runs import print_grid_report
 from space_dist.cli.terminal import STOP, console, say, warn
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.experiment.status import RunStatus
+from space_dist.system.processes import collect_seldom
 
 ROOT = Path(__file__).resolve().parent.parent
 INSTANCES = 100
@@ -25,6 +25,9 @@ PAGE = "http://127.0.0.1:5000/#/experiments?workflowType=machine_learning"
 def main() -> int:
     """Train, report, and say what came out and where to look."""
     STOP.install()
+    collect_seldom()
+    from space_dist.api.grids import frozen  # takes seconds
+
     place, manifest = frozen(ROOT / "configs/grids/quickstart.yaml", Path.cwd() / "runs")
     steps = manifest.cells[0].budget_steps
     say(f"SPaCE and round robin on PointMass: {len(manifest.seeds)} seeds each, {steps:,} environment steps a run")

@@ -18,7 +18,10 @@ arithmetic.settle()  # before any library is loaded that chooses its kernels by 
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError  # noqa: E402
 
 if TYPE_CHECKING:
-    from space_dist.api import ActingPolicy, GridRun, ReportView, Run, load_policy, report_on, run_grid, train
+    from space_dist.api.grids import GridRun, run_grid
+    from space_dist.api.policies import ActingPolicy, load_policy
+    from space_dist.api.reports import ReportView, report_on
+    from space_dist.api.training import Run, train
     from space_dist.config import RunConfig
     from space_dist.instances import InstanceSet
     from space_dist.sb3 import ContextVecEnv, CurriculumCallback
@@ -46,14 +49,18 @@ __all__ = [
 ]
 
 _HOMES = {
-    **dict.fromkeys(
-        ("ActingPolicy", "GridRun", "ReportView", "Run", "load_policy", "report_on", "run_grid", "train"),
-        "space_dist.api",
-    ),
+    "ActingPolicy": "space_dist.api.policies",
     "ContextVecEnv": "space_dist.sb3",
     "CurriculumCallback": "space_dist.sb3",
+    "GridRun": "space_dist.api.grids",
     "InstanceSet": "space_dist.instances",
+    "ReportView": "space_dist.api.reports",
+    "Run": "space_dist.api.training",
     "RunConfig": "space_dist.config",
+    "load_policy": "space_dist.api.policies",
+    "report_on": "space_dist.api.reports",
+    "run_grid": "space_dist.api.grids",
+    "train": "space_dist.api.training",
 }
 
 

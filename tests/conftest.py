@@ -14,6 +14,8 @@ import space_dist  # noqa: F401 # isort: skip - its settings come before NumPy i
 import pytest
 from hypothesis import settings
 
+from space_dist.system.processes import collect_seldom
+
 # Their asserts show what they compared, as those of test modules do.
 pytest.register_assert_rewrite("tests.golden.on_another_cpu", "tests.own_code", "tests.three_rounds")
 
@@ -42,6 +44,7 @@ def _keep_folders_in_memory() -> None:
 
 
 _keep_folders_in_memory()
+collect_seldom()
 
 
 # Files that take longest, from the longest on: minutes of waiting, of emulating, or of both.

@@ -30,9 +30,18 @@ def test_importing_it_imports_nothing_heavy(module: str):
     assert not imported.intersection(HEAVY)
 
 
-@pytest.mark.parametrize("module", ["space_dist.grid.jobs", "space_dist.grid.supervisor", "space_dist.slurm"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "space_dist.grid.jobs",
+        "space_dist.grid.supervisor",
+        "space_dist.slurm",
+        "space_dist.api.grids",
+        "space_dist.cli.grids",
+    ],
+)
 def test_whoever_only_starts_runs_does_not_wait_for_torch(module: str):
-    assert not imported_with(module).intersection({"torch", "mlflow", "stable_baselines3", "sb3_contrib"})
+    assert not imported_with(module).intersection({"torch", "mlflow", "stable_baselines3", "sb3_contrib", "matplotlib"})
 
 
 def test_the_curricula_need_no_environment_either():
@@ -63,3 +72,18 @@ def test_each_error_ends_a_command_with_its_documented_code():
     # 2: retrying cannot help. 75: EX_TEMPFAIL, "requeue me". 1: anything else. 0 would be success.
     codes = {name: getattr(space_dist, name).exit_code for name in errors_exported()}
     assert codes == {"SpaceDistError": 1, "ConfigError": 2, "LedgerError": 1, "RunLockedError": 1, "Interrupted": 75}
+
+
+def test_a_command_looks_for_garbage_seldom_and_whoever_imports_us_as_ever():
+    """Looking through what torch makes as it is imported was a third of a command's start and end."""
+    say = "import gc, sys; sys.argv[1:] = ['--version']; {}; print(gc.get_threshold()[0])"
+    run_it = "from space_dist import cli; exec('try: cli.main()\\nexcept SystemExit: pass')"
+    said = [
+        int(
+            subprocess.run(
+                [sys.executable, "-c", say.format(code)], capture_output=True, text=True, check=True
+            ).stdout.split()[-1]
+        )
+        for code in ("pass", "import space_dist.cli", run_it)
+    ]
+    assert said[0] == said[1] < said[2]

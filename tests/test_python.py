@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,11 +22,12 @@ import space_dist
 from space_dist import config as configs
 from space_dist.api import progress
 from space_dist.api.training import as_config
-from space_dist.config import RunConfig
+from space_dist.config import Mirrors, RunConfig
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.grid.planning import plan
-from space_dist.ledger import CURRICULUM, METRICS
+from space_dist.ledger import CURRICULUM, METRICS, RunWriter
 from space_dist.run.training import Progress
+from space_dist.tracking.pusher import Pusher
 from tests.commanding import command
 from tests.patience import PATIENCE
 from tests.test_learners import N_STEPS, config_for, learner_section
@@ -102,6 +104,29 @@ def test_a_longer_run_that_is_interrupted_goes_on(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         space_dist.train(long, out=tmp_path / "run", resume=True, progress=give_up)
     assert space_dist.Run(tmp_path / "run").status.state == "interrupted"
+    space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    space_dist.train(long, out=tmp_path / "whole", progress=False)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+def test_killed_as_it_is_handed_to_a_larger_budget_it_goes_on_under_that_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = learner_section("ppo")
+    short, long = config_for(tmp_path, section), config_for(tmp_path, section, budget={"steps": 12 * N_STEPS})
+    space_dist.train(short, out=tmp_path / "run", progress=False)
+    hand_over = RunWriter.hand_over
+
+    def die_behind(writer: RunWriter, *arguments: Any) -> Any:
+        hand_over(writer, *arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunWriter, "hand_over", die_behind)
+    with pytest.raises(KeyboardInterrupt):
+        space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match="a larger budget, of 480 steps, when it was killed: ask for"):
+        space_dist.train(short, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "whole", progress=False)
     assert files(tmp_path / "run") == files(tmp_path / "whole")
@@ -212,6 +237,26 @@ def test_train_does_what_the_command_does(tmp_path: Path, monkeypatch: pytest.Mo
     assert isinstance(run.config, RunConfig)
     with pytest.raises(LedgerError, match="holds no run"):
         space_dist.Run(tmp_path / "nowhere")
+
+
+def test_a_run_with_a_dashboard_ends_with_where_to_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The mirror's own process is stood in for by what it writes: the quickstart's test has a whole one."""
+
+    def start(pusher: Pusher, tracking: Mirrors, folder: Path, log_file: Path) -> None:
+        said = "1 runs are up to date in MLflow\\nLook at http://x/#/experiments/1 once\\n"
+        pusher._where, pusher._folder, pusher._log_file = str(tracking.uri), folder, log_file
+        pusher._said_before = log_file.write_text("Look at an older page\n")
+        pusher._process = subprocess.Popen(["/bin/sh", "-c", f"printf '{said}' >> {shlex.quote(str(log_file))}"])
+
+    monkeypatch.setattr(Pusher, "__init__", start)
+    config = config_for(tmp_path, learner_section("ppo"), tracking={"uri": "http://x"})
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
+    assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", tmp_path / "run") == 0
+    *_, done, look = capsys.readouterr().out.splitlines()
+    assert done.endswith(f"environment steps. {tmp_path / 'run'}")
+    assert look == "Look at http://x/#/experiments/1 once"
 
 
 def test_a_policy_acts_as_the_run_does(tmp_path: Path) -> None:

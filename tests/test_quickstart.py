@@ -28,6 +28,8 @@ def test_the_quickstart_prints_the_published_numbers(empty_store: Path, tmp_path
     printed = re.findall(rf"^  (test return, IQM \[95 %\]: {NUMBERS} \(3/3\))$", done.stdout, re.MULTILINE)
     reached = re.findall(r"^(SPaCE's set reached all 100 instances in \d of 3 runs)", done.stdout, re.MULTILINE)
     assert (len(printed), len(reached)) == (2, 1)
+    page = r"^Look at (http://127\.0\.0\.1:5000/#/experiments/\d+/runs\?workflowType=machine_learning) once `mlflow ui "
+    assert len(re.findall(page, done.stderr, re.MULTILINE)) == 1
     quickstart, environments = ((ROOT / file).read_text() for file in ("docs/index.md", "docs/environments.md"))
     for line in (*printed, *reached):
         assert line in quickstart

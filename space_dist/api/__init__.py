@@ -3,14 +3,6 @@
     run = space_dist.train("shipped:pointmass_space", overrides={"budget.steps": 20_000}, workers=0)
     run.final, run.rows(), run.policy().predict(observation)
 
-All of it is `space_dist.NAME`, imported when it is first asked for: `import space_dist` alone costs next to nothing.
+All of it is `space_dist.NAME`, imported when it is first asked for: `import space_dist` alone costs next to nothing,
+and whoever works through a frozen grid waits neither for torch nor for figures.
 """
-
-from __future__ import annotations
-
-from space_dist.api.grids import GridRun, run_grid
-from space_dist.api.policies import ActingPolicy, load_policy
-from space_dist.api.reports import ReportView, report_on
-from space_dist.api.training import Run, train
-
-__all__ = ["ActingPolicy", "GridRun", "ReportView", "Run", "load_policy", "report_on", "run_grid", "train"]

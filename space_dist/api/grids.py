@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from space_dist.api.progress import line_of_grid, shown
-from space_dist.api.reports import ReportView, report_on
-from space_dist.api.training import Run
 from space_dist.experiment import manifest as manifests
 from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
 from space_dist.experiment.status import RunStatus, run_statuses
@@ -21,6 +19,8 @@ from space_dist.system.provenance import code_digest
 from space_dist.system.workplace import lasting, private_ray, workplace
 
 if TYPE_CHECKING:
+    from space_dist.api.reports import ReportView
+    from space_dist.api.training import Run
     from space_dist.grid.jobs import Mode
 
 
@@ -56,11 +56,15 @@ class GridRun:
 
     def runs(self) -> dict[tuple[str, int], Run]:
         """Those that have begun, by (label of the cell, seed)."""
+        from space_dist.api.training import Run
+
         ledgers = {(run.cell.label, run.seed): self.grid.ledger(run) for run in self.manifest.runs()}
         return {key: Run(ledger.folder) for key, ledger in ledgers.items() if ledger.status_file.exists()}
 
     def report(self, **how: Any) -> ReportView:
         """Tables with intervals, and figures: see `report_on`, whose keywords this takes."""
+        from space_dist.api.reports import report_on
+
         return report_on(self.folder, **how)
 
 

@@ -7,10 +7,11 @@ import html
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from space_dist.grid.conductor import Overview
-from space_dist.run.training import Progress
+if TYPE_CHECKING:
+    from space_dist.grid.conductor import Overview
+    from space_dist.run.training import Progress
 
 _SECONDS: Final = 0.25  # between two changes of the line
 

@@ -21,6 +21,7 @@ from space_dist.cli.slurm import slurm_app
 from space_dist.cli.worlds import env_app, render
 from space_dist.errors import SpaceDistError
 from space_dist.system.importing import look_here_too
+from space_dist.system.processes import collect_seldom
 
 app = typer.Typer(
     name="space-dist", no_args_is_help=True, pretty_exceptions_enable=False,
@@ -56,6 +57,7 @@ def _options(
 
 def main() -> None:
     """Run a command; every error that a user can cause ends it with one sentence and its exit code."""
+    collect_seldom()
     keep_outputs()
     for sentence in overruled():
         warn(f"space-dist: {sentence}")

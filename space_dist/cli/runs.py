@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -59,6 +59,7 @@ def train(
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
     say(f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}")
+    _name_pages(outcome.pages)
     if outcome.tracking_warning:
         warn(f"warning: {outcome.tracking_warning}")
 
@@ -295,12 +296,18 @@ def sync(
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),
         highlight=False,
     )
-    for page in result.pages:
-        console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
+    _name_pages(result.pages)
     for folder, reason in result.failed.items():
         warn(f"space-dist: {folder} is not mirrored: {reason}")
     if result.failed:
         raise typer.Exit(1)
+
+
+def _name_pages(pages: Iterable[str]) -> None:
+    from space_dist.tracking.pusher import LOOK_AT
+
+    for page in pages:
+        say(f"{LOOK_AT}{page}")
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from space_dist.experiment.status import Attempts, RunStatus, concluded, may_ret
 from space_dist.ledger import Lock
 from space_dist.system.files import in_words, locked
 from space_dist.system.provenance import code_digest
-from space_dist.tracking.pusher import Pusher
+from space_dist.tracking.pusher import LOOK_AT, Pusher
 
 log = logging.getLogger("space_dist")
 
@@ -302,8 +302,9 @@ def working_on(
 ) -> Iterator[None]:
     """Be the only one who works on the grid, once whoever does so now is gone, and keep MLflow's mirror meanwhile.
 
-    `say` hears why it takes time, and of a mirror that could not be brought up to date. Raises Interrupted if asked to
-    stop while waiting, RunLockedError at once if not to `wait`, LedgerError if the folder cannot be written.
+    `say` hears why it takes time, of a mirror that could not be brought up to date, and of its page. Raises
+    Interrupted if asked to stop while waiting, RunLockedError at once if not to `wait`, LedgerError if the folder
+    cannot be written.
     """
     lock = _acquired(grid, wait, stop_requested, say)
     pusher = None
@@ -314,8 +315,11 @@ def working_on(
         yield
     finally:
         lock.release()  # by which the pusher knows that it may end
-        if pusher is not None and (warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid")):
-            say(f"warning: {warning}")
+        if pusher is not None:
+            if warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid"):
+                say(f"warning: {warning}")
+            for page in pusher.pages():
+                say(f"{LOOK_AT}{page}")
 
 
 def _acquired(

@@ -11,6 +11,7 @@ each a line on standard output. When its input ends, so does it, after its run h
 
 from __future__ import annotations
 
+import gc
 import os
 
 # ruff: noqa: E402 - one thread for all arithmetic, before any library reads these
@@ -42,6 +43,7 @@ from space_dist.experiment.status import Attempts, is_done, last_lines, slurm_jo
 from space_dist.system.files import open_own
 from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
+from space_dist.system.processes import collect_seldom
 
 OUTPUT = "output.txt"
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
@@ -420,7 +422,9 @@ def main() -> None:
     look_here_too()  # import paths in configs may name the user's own modules
     results = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is not a result
+    collect_seldom()
     preload()
+    gc.freeze()  # forks look through none of it, and share its memory
     supervisor, manager = Supervisor(), _Manager()
     print(json.dumps({"ready": os.getpid()}), file=results, flush=True)
     for task in manager.tasks():

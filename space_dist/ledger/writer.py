@@ -89,10 +89,11 @@ class RunWriter:
                 atomic_write(path, content)
             self._files |= {name: [sha256] for name, sha256 in hashes.items()}
 
-    def hand_over(self, status: Status, keep: Callable[[Checkpoint], bool]) -> Status:
+    def hand_over(self, status: Status, config: str, keep: Callable[[Checkpoint], bool]) -> Status:
         """Make this a run of another identity, `status.identity`: the checkpoints that `keep` are its own from now on.
 
         The others are forgotten. Returns where it stands then. Interrupted at any moment, it can be done again.
+        `config` is to be written next, by `write_config`; until then the status names its hash and the old one's.
         """
         with _clear_errors(self.ledger.folder), self._lock.held():
             newest: Path | None = None
@@ -119,7 +120,10 @@ class RunWriter:
                 status = dataclasses.replace(
                     status, round=0, steps=0, committed={}, checkpoint=None, checkpoint_sha256=None
                 )  # fmt: skip
-            self._write_status(status)
+            files = {} if self.status is None else self.status.files
+            name = self.ledger.config.name
+            both = sorted({*files.get(name, []), hashlib.sha256(config.encode()).hexdigest()})
+            self._write_status(dataclasses.replace(status, files={**status.files, name: both}))
             for file in forgotten:
                 file.unlink()
         return status

@@ -59,11 +59,12 @@ _FINAL_PUSH_SECONDS = 45.0  # for all of it: a server that answers badly (20 s a
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a launch ended: the run's ledger, whether it was done before, and what MLflow's mirror lacks, if anything."""
+    """How a launch ended: the run's ledger, whether it was done before, what MLflow's mirror lacks, and its pages."""
 
     ledger: Ledger
     already_done: bool = False
     tracking_warning: str | None = None
+    pages: tuple[str, ...] = ()
 
 
 def launch(
@@ -124,8 +125,10 @@ class ActiveRun:
 
     def finished(self) -> Outcome:
         """How it ended, once MLflow's mirror has what it can have."""
-        warning = None if self.pusher is None else self.pusher.warning(_FINAL_PUSH_SECONDS, "run")
-        return replace(self.outcome, tracking_warning=warning)
+        if self.pusher is None:
+            return self.outcome
+        warning = self.pusher.warning(_FINAL_PUSH_SECONDS, "run")
+        return replace(self.outcome, tracking_warning=warning, pages=tuple(self.pusher.pages()))
 
 
 @contextlib.contextmanager
@@ -213,7 +216,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         )  # fmt: skip
     stored = configs.dump(_self_contained(config))
     if shorter is not None:
-        now_at = writer.hand_over(status, within(shorter, blueprint.spec.horizon))
+        now_at = writer.hand_over(status, stored, within(shorter, blueprint.spec.horizon))
         status = replace(status, steps=now_at.steps, round=now_at.round)
         log.info("going on under a larger budget, from round %d", status.round)
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
@@ -289,7 +292,12 @@ def _refuse_other_run(
         ) from error
     digests = train.digest(), test.digest()
     if identity == configs.identity(stored, *digests, weights=learned):
-        return None
+        if before is not None and len(before.files.get(ledger.config.name, [])) > 1:
+            raise ConfigError(
+                f"{ledger.folder} had been asked to go on under a larger budget, of {before.budget_steps:,} steps, "
+                "when it was killed: ask for that budget again"
+            )
+        return None  # an earlier version's identity
     longer = stored.model_copy(update={"budget": config.budget})
     if identity == configs.identity(longer, *digests, weights=learned) and is_longer(stored, config):
         return stored

@@ -1,1 +1,1 @@
-"""What is around us: `files`, signals (`interrupts`), modules (`importing`), `provenance`, the `workplace`."""
+"""What is around us: `files`, signals (`interrupts`), modules (`importing`), `processes`, `provenance`, `workplace`."""

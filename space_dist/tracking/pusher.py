@@ -14,6 +14,8 @@ from space_dist.system.files import appending
 from space_dist.system.importing import PYTHON
 
 _KILL_SECONDS: Final = 5.0
+_MOST_SAID: Final = 1 << 20  # bytes of what it says that are looked through
+LOOK_AT: Final = "Look at "  # begins the lines in which `sync` names MLflow's pages
 
 
 class Pusher:
@@ -28,6 +30,7 @@ class Pusher:
         self._where, self._folder, self._log_file = " and ".join([*places, *tracking.sinks]), folder, log_file
         command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(folder)]
         with appending(log_file) as output:
+            self._said_before = os.fstat(output.fileno()).st_size
             # A session of its own: Ctrl-C is for the work; the pusher ends by itself once whoever works has let go.
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
@@ -41,6 +44,14 @@ class Pusher:
             f"{self._where} could not be brought up to date; nothing is lost: `space-dist sync {self._folder}` "
             f"replays the {what} (details: {self._log_file})"
         )
+
+    def pages(self) -> list[str]:
+        """Where to look at what was pushed, in words; none before it has ended well, and none without MLflow."""
+        with contextlib.suppress(OSError), self._log_file.open("rb") as log:
+            log.seek(self._said_before)
+            lines = log.read(_MOST_SAID).decode(errors="replace").splitlines()
+            return [line.removeprefix(LOOK_AT) for line in lines if line.startswith(LOOK_AT)]
+        return []
 
 
 def ended_within(pusher: subprocess.Popen[bytes], seconds: float) -> bool:
