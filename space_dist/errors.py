@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 
 
 class SpaceDistError(Exception):
@@ -32,21 +31,6 @@ class Interrupted(SpaceDistError):  # noqa: N818 - an interruption is an outcome
     """The run was asked to stop and wrote a checkpoint: `--resume` continues it."""
 
     exit_code = 75  # EX_TEMPFAIL of sysexits.h: what batch systems take for "requeue me"
-
-
-@dataclass
-class Findings:
-    """Of a check of somebody's code.
-
-    faults: what must be repaired, a sentence each.  notes: what is allowed but may not be meant.
-    """
-
-    faults: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
-class FaultError(Exception):
-    """A fault that ends such a check: what comes behind could not be told apart from it."""
 
 
 @contextlib.contextmanager

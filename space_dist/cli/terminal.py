@@ -102,7 +102,8 @@ from typing import Annotated, Optional
 import typer
 from rich.console import Console
 
-from space_dist.errors import ConfigError, Findings, SpaceDistError, nearest
+from space_dist.errors import ConfigError, SpaceDistError, nearest
+from space_dist.system.findings import Findings
 
 console = Console()
 errors = Console(stderr=True)

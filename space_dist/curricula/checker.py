@@ -33,10 +33,11 @@ from space_dist.curricula.interface import (
     decode_state,
     encode_state,
 )
-from space_dist.errors import ConfigError, FaultError, Findings, SpaceDistError
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.seeding import Purpose, generator
+from space_dist.system.findings import FaultError, Findings
 
 DECISIONS: Final = 30
 _DRAWS: Final = Draws(count=64, walks=4)

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, close, distribution_of, make_batched
 from space_dist.envs.interface import FloatArray, Step
 from space_dist.envs.observations import Observations
-from space_dist.errors import ConfigError, FaultError, Findings, SpaceDistError
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, episode_seeds, generator
+from space_dist.system.findings import FaultError, Findings
 
 COMPARED_STEPS: Final = 200  # of an episode; horizons are played to their end once
 N_CONTEXTS: Final = 8
