@@ -111,6 +111,7 @@ class AlpGmm(Curriculum):
         count, n, d = self._draws.count, len(self._instances), len(self._bounds.names)
         uniform = random.random((count, d))
         instances = random.integers(n, size=count)
+        # All of it is drawn whether or not a mixture is there: what is uniform does not depend on that.
         at_random: BoolArray = random.random(count) < self._random_share
         if len(state.means):
             drawn = self._from_mixture(state, random)
@@ -131,6 +132,7 @@ class AlpGmm(Curriculum):
         normal = random.standard_normal((self._draws.count, state.means.shape[1]))
         roots = np.linalg.cholesky(state.covariances)
         samples = state.means[chosen] + np.einsum("nij,nj->ni", roots[chosen], normal)
+        # Without the last feature, which is the learning progress.
         clipped: FloatArray = np.clip(samples[:, :-1], 0.0, 1.0)
         return clipped
 
@@ -167,6 +169,7 @@ def fit_mixture(rows: FloatArray, most: int, seed: int) -> tuple[FloatArray, Flo
     from sklearn.mixture import GaussianMixture  # a second to import, and only this curriculum needs it
     from threadpoolctl import threadpool_limits
 
+    # One thread: the bits of a product depend on how many share it.
     with warnings.catch_warnings(), threadpool_limits(limits=1):
         warnings.simplefilter("ignore")  # rows may repeat, and not every mixture need converge to be compared
         counts = range(FEWEST_COMPONENTS, min(most, len(rows)) + 1)

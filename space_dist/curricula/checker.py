@@ -130,6 +130,7 @@ class _Check:
         """states: the one that the object returned, and the same as a checkpoint gives it back."""
         state, restored = states
         what = f"step(){flavour}"
+        # Copies are handed over, so that a change in place is seen beside what was meant.
         given = copy.deepcopy((state, feedback))
         answer: tuple[State, Selection, Any] = _called(what, lambda: used.step(*given))
         for name, before, after in zip(("state", "feedback"), (state, feedback), given, strict=True):

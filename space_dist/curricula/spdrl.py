@@ -314,5 +314,6 @@ def _standardised(problem: Objective, least_std: FloatArray | None) -> tuple[Obj
     if least_std is None:
         return objective, start, None
     low = np.full(len(start), -np.inf)
+    # In these coordinates L is L_old^-1 L, whose diagonal is that of L over that of L_old.
     low[d : 2 * d] = np.log(least_std) - np.log(np.diag(old.factor))
     return objective, start, low

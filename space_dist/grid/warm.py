@@ -75,6 +75,7 @@ class WarmSupervisor:
             if not select.select([process.stdout], [], [], seconds)[0]:
                 return None
             chunk = os.read(process.stdout.fileno(), _CHUNK)
+            # End of file: it is gone, and waiting reaps it.
             if not chunk:
                 process.wait()
                 self._process = None
@@ -246,6 +247,7 @@ def slurms_memory_of_a_core() -> list[float]:
     if (given := os.environ.get("SLURM_MEM_PER_CPU", "")).isdecimal():
         shares.append(float(given))
     if (given := os.environ.get("SLURM_MEM_PER_NODE", "")).isdecimal():
+        # SLURM sets one of the two, by how memory was asked for (--mem-per-cpu or --mem).
         shares.append(float(given) / cores())
     return shares
 
