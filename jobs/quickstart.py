@@ -31,7 +31,7 @@ def main() -> int:
     place, manifest = frozen(ROOT / "configs/grids/quickstart.yaml", Path.cwd() / "runs")
     steps = manifest.cells[0].budget_steps
     say(f"SPaCE and round robin on PointMass: {len(manifest.seeds)} seeds each, {steps:,} environment steps a run")
-    found = run_frozen(place, manifest)
+    found = run_frozen(place, manifest, mode="pool")
     code = tell(manifest, place, found)
     if code:
         say("`make quickstart` tries again and goes on where the others stopped.")

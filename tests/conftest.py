@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import space_dist  # noqa: F401 # isort: skip - its settings come before NumPy is loaded
 
@@ -14,6 +15,9 @@ import pytest
 from hypothesis import settings
 
 from space_dist.system.processes import collect_seldom
+
+# Their asserts show what they compared, as those of test modules do.
+pytest.register_assert_rewrite("tests.golden.on_another_cpu", "tests.own_code", "tests.three_rounds")
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -105,6 +109,17 @@ def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
     (tmp_path / "cwd").mkdir()
     monkeypatch.chdir(tmp_path / "cwd")
     return f"sqlite:///{store / 'mlflow.db'}"
+
+
+@pytest.fixture(scope="module")
+def cluster_class() -> Any:
+    """The cluster of actors on a private Ray, imported once its settings are made."""
+    from space_dist.system.workplace import private_ray
+
+    private_ray()
+    from space_dist.run.ray_cluster import RayCluster
+
+    return RayCluster
 
 
 @pytest.fixture(scope="module")

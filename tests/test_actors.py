@@ -21,7 +21,7 @@ from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.patience import PATIENCE
-from tests.test_distributed import ROOT, cluster_class, config, reference, results  # noqa: F401
+from tests.test_distributed import ROOT, config, reference, results  # noqa: F401
 from tests.test_learners import config_for, learner_section
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("one_ray")]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from space_dist.envs import BatchedCartPole, ContextObservation, ContextVisible, make_batched
 from space_dist.envs.cartpole import BOUNDS as CARTPOLE_BOUNDS
 from space_dist.instances import read_csv, refuse_overlap
+from tests.one_slot import seen_by
 
 ENV_ID = "space_dist/CartPole-v0"
 INSTANCES = Path(__file__).parent.parent / "configs" / "instances"
@@ -192,15 +193,7 @@ def test_neighbours_and_the_number_of_slots_do_not_matter() -> None:
         lengths[slot], seeds[slot] = 0.6, 11
         env = BatchedCartPole(n)
         reset(env, lengths, seeds.tolist())
-        told = []
-        for action in actions:
-            everyone = random.integers(2, size=n)
-            everyone[slot] = action
-            step = env.step(everyone)
-            told.append((step.observations[slot].tobytes(), float(step.rewards[slot])))
-            if step.terminated[slot]:
-                break
-        return told
+        return seen_by(slot, env, actions, lambda: random.integers(2, size=n))
 
     alone = among(1, 0)
     assert len(alone) > 10

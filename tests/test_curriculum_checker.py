@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from space_dist.curricula.checker import DECISIONS, check
 from space_dist.errors import ConfigError
-from space_dist.instances import ContextBounds, InstanceSet, read_features
+from space_dist.instances import InstanceSet, read_features
 from tests.commanding import command
+from tests.two_features import BOUNDS, scattered
 
-BOUNDS = ContextBounds(("a", "b"), np.array([0.0, -10.0]), np.array([2.0, 10.0]))
 FAULTS = {
     "Unseeded": "two new objects, given the same state and feedback, give another state.scores each (decision 1)",
     "GlobalGenerator": "two new objects, given the same state and feedback, give another state.scores each",
@@ -61,9 +60,7 @@ FAULTS = {
 
 
 def instances(n: int = 40) -> InstanceSet:
-    """n instances with ids 10, 11, ..."""
-    contexts = np.random.default_rng(3).uniform(BOUNDS.low, BOUNDS.high, size=(n, 2))
-    return InstanceSet(np.arange(10, 10 + n), contexts, BOUNDS.names)
+    return scattered(n, first_id=10)
 
 
 @pytest.mark.parametrize("kind", FAULTS)

@@ -17,7 +17,6 @@ from space_dist.ledger import CURRICULUM, METRICS
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
-from space_dist.system.workplace import private_ray
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,14 +30,6 @@ pytestmark = pytest.mark.ray
 
 def config(workers: int, *settings: str) -> configs.RunConfig:
     return configs.load(ROOT / "configs/pointmass_space.yaml", [*SMALL, f"resources.workers={workers}", *settings])
-
-
-@pytest.fixture(scope="module")
-def cluster_class() -> Any:
-    private_ray()
-    from space_dist.run.ray_cluster import RayCluster
-
-    return RayCluster
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from space_dist.tracking import NOTE_TAG, TrackingError, find, follow, sync
 from space_dist.tracking.looking import final_return, last_evaluation
 from tests.grids import ROOT
 from tests.test_report import GROWTH, STARTED, continue_run, start_run
-from tests.test_tracking import contents, histories
+from tests.test_tracking import contents, histories, stop_in
 
 sys.path.append(str(ROOT / "jobs"))
 
@@ -348,22 +348,18 @@ def test_following_a_grid_at_rest_asks_mlflow_nothing(
 ) -> None:
     monkeypatch = pytest.MonkeyPatch()
     grid = interrupted(tmp_path / "demo", uri, 0)
-    rounds = 0
 
-    def stop() -> bool:
-        nonlocal rounds
-        rounds += 1
-        if rounds == 2:
-            Attempts(ledger_of(grid, 0, 0)).sign()  # a heartbeat is no news
-            for name in ("search_runs", "get_run", "create_run", "log_batch", "set_tag"):
-                monkeypatch.setattr(MlflowClient, name, None)
-            monkeypatch.setattr(Ledger, "status", None)
-        if rounds == 4:
-            monkeypatch.undo()
-            run_to(grid, 0, 0, attempt=2)
-        return rounds == 5
+    def fall_silent() -> None:
+        Attempts(ledger_of(grid, 0, 0)).sign()  # a heartbeat is no news
+        for name in ("search_runs", "get_run", "create_run", "log_batch", "set_tag"):
+            monkeypatch.setattr(MlflowClient, name, None)
+        monkeypatch.setattr(Ledger, "status", None)
 
-    result = follow(grid.folder, poll_seconds=0.0, stop=stop)
+    def go_on() -> None:
+        monkeypatch.undo()
+        run_to(grid, 0, 0, attempt=2)
+
+    result = follow(grid.folder, poll_seconds=0.0, stop=stop_in(5, {2: fall_silent, 4: go_on}))
     assert (result.runs, result.created, result.rows, result.failed) == (1, 1, 9, {})
 
 
@@ -372,25 +368,18 @@ def test_a_follower_takes_nothing_for_granted_after_an_outage(
 ) -> None:
     """A store that has lost its runs meanwhile: everything is pushed again."""
     grid = interrupted(tmp_path / "demo", uri, 0)
-    rounds = 0
-
-    def stop() -> bool:
-        nonlocal rounds
-        rounds += 1
-        if rounds == 2:
-            begin(grid, 0, 1).end(1, Ended(Cause.CONFIG_ERROR, "no"))
-            parent, children = everything(uri)
-            for run in (parent, *children.values()):
-                MlflowClient(uri).delete_run(run.info.run_id)
-            monkeypatch.setattr(MlflowClient, "search_runs", mortal)
-        if rounds == 3:
-            monkeypatch.undo()
-        return rounds == 4
 
     def mortal(*_: Any, **__: Any) -> Any:
         raise ConnectionError("away")
 
-    result = follow(grid.folder, poll_seconds=0.0, stop=stop)
+    def lose() -> None:
+        begin(grid, 0, 1).end(1, Ended(Cause.CONFIG_ERROR, "no"))
+        parent, children = everything(uri)
+        for run in (parent, *children.values()):
+            MlflowClient(uri).delete_run(run.info.run_id)
+        monkeypatch.setattr(MlflowClient, "search_runs", mortal)
+
+    result = follow(grid.folder, poll_seconds=0.0, stop=stop_in(4, {2: lose, 3: monkeypatch.undo}))
     assert (result.runs, result.created, result.rows) == (2, 3, 6)
     _, children = everything(uri)
     assert len(histories(uri, children["eta=0.1, seed 0"])["test/return"]) == 2

@@ -203,8 +203,8 @@ def test_a_folder_that_holds_something_is_left_alone(
 @pytest.mark.parametrize(("words", "sentence"), [
     (("train", "shipped:pointmass_space", "--workers", "2", "--out", "run"),
      "resources.workers: 2 needs Ray: pip install 'space-dist[ray]', or use resources.workers=0"),
-    (("grid", "run", "shipped:pointmass_small", "--max-parallel", "2", "--root", "x"),
-     "a grid whose runs go side by side needs Ray: pip install 'space-dist[ray]'"),
+    (("grid", "run", "shipped:pointmass_small", "--mode", "pool", "--root", "x"),
+     "a grid on a cluster, or whose runs have rollout actors, needs Ray: pip install 'space-dist[ray]'"),
     (("grid", "submit", "shipped:pointmass_small", "--address", "http://127.0.0.1:1"),
      "`grid submit` needs Ray: pip install 'space-dist[ray]'"),
 ])  # fmt: skip

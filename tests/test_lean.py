@@ -20,12 +20,22 @@ from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, NORM
 from space_dist.learner import lean, make_learner
 from space_dist.learner.lean import LeanBuffer
-from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
+from space_dist.ledger import Ledger
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.run.training import Progress
 from space_dist.system.interrupts import StopRequests
-from tests.test_learner import BOX, DISCRETE_LINE, LINE, bits, learner_for, shards_of, small, update
+from tests.test_learner import (
+    BOX,
+    DISCRETE_LINE,
+    LINE,
+    bits,
+    learner_for,
+    resumed_to_the_bit,
+    shards_of,
+    small,
+    update,
+)
 
 UPDATES = 20
 
@@ -213,21 +223,7 @@ def test_the_policy_that_acted_is_its_own_to_the_bit(env_id: str, monkeypatch: p
 
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
 def test_a_checkpoint_restores_it_bit_for_bit(env_id: str) -> None:
-    config = small(update="lean", learning_rate_schedule="linear")
-    learner = learner_for(config, env_id)
-    for number in range(2):
-        update(learner, number, env_id)
-    stored = encode_checkpoint(Checkpoint(2, *learner.save()))
-    at_the_time = bits(learner)
-    metrics = [update(learner, number, env_id) for number in (2, 3)]
-
-    fresh = learner_for(config, env_id, seed=5)  # whose initial network is another one
-    again = decode_checkpoint(stored)
-    fresh.load(again.arrays, again.data)
-    assert bits(fresh) == at_the_time != bits(learner)
-    fresh._seed = learner._seed
-    assert [update(fresh, number, env_id) for number in (2, 3)] == metrics
-    assert bits(fresh) == bits(learner)
+    resumed_to_the_bit(small(update="lean", learning_rate_schedule="linear"), env_id)
 
 
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])

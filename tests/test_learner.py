@@ -257,10 +257,8 @@ def test_shards_in_another_order_are_refused() -> None:
 # ---- updating ----
 
 
-@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE])
-@pytest.mark.parametrize("config", [small(), small(learning_rate_schedule="linear"), small("trpo")],
-                         ids=["ppo", "linear", "trpo"])  # fmt: skip
-def test_a_checkpoint_restores_the_learner_bit_for_bit(config: LearnerConfig, env_id: str) -> None:
+def resumed_to_the_bit(config: LearnerConfig, env_id: str) -> tuple[Any, Any]:
+    """A learner after four updates, and one that began otherwise and went on from its checkpoint of the second."""
     learner = learner_for(config, env_id)
     for number in range(2):
         update(learner, number, env_id)
@@ -276,6 +274,14 @@ def test_a_checkpoint_restores_the_learner_bit_for_bit(config: LearnerConfig, en
     fresh._seed = learner._seed
     assert [update(fresh, number, env_id) for number in (2, 3)] == metrics
     assert bits(fresh) == bits(learner)
+    return learner, fresh
+
+
+@pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE])
+@pytest.mark.parametrize("config", [small(), small(learning_rate_schedule="linear"), small("trpo")],
+                         ids=["ppo", "linear", "trpo"])  # fmt: skip
+def test_a_checkpoint_restores_the_learner_bit_for_bit(config: LearnerConfig, env_id: str) -> None:
+    learner, fresh = resumed_to_the_bit(config, env_id)
     told, expected = fresh.policy(4), learner.policy(4)
     for part, part_expected in ((told.actor, expected.actor), (told.critics[0], expected.critics[0])):
         for (matrix, bias), (matrix_expected, bias_expected) in zip(part, part_expected, strict=True):

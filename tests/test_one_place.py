@@ -1,4 +1,4 @@
-"""Grids that are worked through one run after another: on this machine, without Ray, whoever is killed."""
+"""Grids that are worked through on this machine without Ray, at one place or several, whoever is killed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from space_dist.experiment.manifest import Grid
 from space_dist.experiment.status import Attempts
 from space_dist.grid import warm
 from space_dist.grid.planning import plan
-from space_dist.grid.warm import LocalExecutor, local_is_enough, memory_of_a_core
+from space_dist.grid.warm import LocalExecutor, memory_of_a_core, needs_ray
 from space_dist.ledger import METRICS, Row
 from tests import prepared
 from tests.grids import TINY, write_grid, write_line_instances
@@ -36,9 +36,9 @@ def write(folder: Path, **sections: Any) -> Path:
     return write_grid(folder, grid={}, set=settings, **sections)
 
 
-def start(folder: Path) -> BaseProcess:
-    """`grid run` of two runs, one after another."""
-    arguments = ["grid", "run", write(folder), "--root", folder / "runs", "--max-parallel", 1]
+def start(folder: Path, at_a_time: int = 1) -> BaseProcess:
+    """`grid run` of two runs, one after another or side by side."""
+    arguments = ["grid", "run", write(folder), "--root", folder / "runs", "--max-parallel", at_a_time]
     return prepared.command(arguments, folder / "said.txt", before=without_ray)
 
 
@@ -75,21 +75,25 @@ def gate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
+def supervisors(conductor: BaseProcess) -> list[psutil.Process]:
+    return [child for child in psutil.Process(conductor.pid).children()
+            if "space_dist.grid.supervisor" in child.cmdline()]  # fmt: skip
+
+
+def is_under_way(grid: Grid, number: int) -> bool:
+    ledger = grid.ledger(grid.manifest().runs()[number]) if grid.manifest_file.exists() else None
+    return ledger is not None and ledger.status_file.exists() and ledger.owner_alive() and ledger.status().round > 0
+
+
 @pytest.fixture
 def under_way(gate: Path, tmp_path: Path) -> Iterator[tuple[BaseProcess, psutil.Process, Grid]]:
     """A conductor and its supervisor, in the middle of the first of its two runs."""
     conductor, grid = start(tmp_path), Grid(tmp_path / "runs/small")
     assert gate.exists()
 
-    def begun() -> bool:
-        runs = grid.manifest().runs() if grid.manifest_file.exists() else []
-        return any(grid.ledger(run).owner_alive() and grid.ledger(run).status().round > 0
-                   for run in runs if grid.ledger(run).status_file.exists())  # fmt: skip
-
     try:
-        await_(begun, "the first run to be under way")
-        [supervisor] = [child for child in psutil.Process(conductor.pid).children()
-                        if "space_dist.grid.supervisor" in child.cmdline()]  # fmt: skip
+        await_(lambda: is_under_way(grid, 0), "the first run to be under way")
+        [supervisor] = supervisors(conductor)
         yield conductor, supervisor, grid
     finally:
         conductor.kill()
@@ -139,7 +143,7 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
     made = plan(write(tmp_path), tmp_path / "runs")
     run = made.manifest.runs()[0]
     found: list[tuple[Any, Ended | None]] = []
-    with LocalExecutor(made.grid, made.manifest, lambda: None) as place:
+    with LocalExecutor(made.grid, made.manifest, 1, lambda: None) as place:
         place.start([(run, 1)])
         assert place.room() == 0
         await_(lambda: Attempts(made.grid.ledger(run)).history().begun == 1, "the attempt to begin")
@@ -154,16 +158,70 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
     assert ended == Ended(Cause.KILLED, "its supervisor was killed")
 
 
-def test_ray_is_for_runs_with_actors_and_for_several_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    manifest = plan(write(tmp_path), tmp_path / "runs").manifest
-    runs = manifest.runs()
-    assert local_is_enough(manifest, runs, 1)
-    assert local_is_enough(manifest, runs[:1], None)
-    assert not local_is_enough(manifest, runs, 2)
-    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "1")
-    assert local_is_enough(manifest, runs, None)
-    with_actors = plan(write(tmp_path, name="acting", resources={"workers": 1}), tmp_path / "runs").manifest
-    assert not local_is_enough(with_actors, with_actors.runs(), 1)
+def test_two_side_by_side_are_the_same_and_one_that_is_killed_costs_the_other_nothing(
+    gate: Path, reference: list[list[Row]], tmp_path: Path
+) -> None:
+    conductor, grid = start(tmp_path, at_a_time=2), Grid(tmp_path / "runs/small")
+    try:
+        await_(lambda: is_under_way(grid, 0) and is_under_way(grid, 1), "both runs to be under way")
+        first, second = supervisors(conductor)
+        first.kill()
+        gate.unlink()
+        assert rows(finished(conductor, tmp_path)) == reference
+    finally:
+        conductor.kill()
+        conductor.join()
+    assert sorted(map(len, ends(grid))) == [1, 2]
+    assert sorted(str(cause) for each in ends(grid) for cause in each) == ["None", "None", "killed"]
+    assert not any(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in (first, second))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_nobody_outlives_a_conductor_of_several_places(
+    gate: Path, reference: list[list[Row]], number: int, tmp_path: Path
+) -> None:
+    conductor, grid = start(tmp_path, at_a_time=2), Grid(tmp_path / "runs/small")
+    try:
+        await_(lambda: is_under_way(grid, 0) and is_under_way(grid, 1), "both runs to be under way")
+        family = [one for each in supervisors(conductor) for one in (each, *each.children(recursive=True))]
+        assert len(family) == 4  # two supervisors, each with its run
+        psutil.Process(conductor.pid).send_signal(number)
+        conductor.join(PATIENCE)
+    finally:
+        conductor.kill()
+        conductor.join()
+    await_(lambda: not any(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in family), "their ends")
+    assert [grid.ledger(run).status().state for run in grid.manifest().runs()] == ["interrupted"] * 2
+    gate.unlink()
+    assert rows(finished(start(tmp_path, at_a_time=2), tmp_path)) == reference
+
+
+def test_a_place_is_free_again_once_its_attempt_has_ended(tmp_path: Path) -> None:
+    made = plan(write(tmp_path), tmp_path / "runs")
+    first, second = made.manifest.runs()
+    found: list[tuple[Any, Ended | None]] = []
+    with LocalExecutor(made.grid, made.manifest, 2, lambda: None) as places:
+        assert (places.size, places.room()) == (2, 2)
+        places.start([(first, 1)])
+        assert places.room() == 1
+        places.start([(second, 1)])
+        assert places.room() == 0
+        await_(lambda: bool(found.extend(places.poll()) or len(found) == 2), "both attempts to end")
+        assert places.room() == 2
+    assert {run.seed: ended for run, ended in found} == {0: Ended(None), 1: Ended(None)}
+
+
+def test_ray_is_for_runs_with_actors(tmp_path: Path) -> None:
+    assert not needs_ray(plan(write(tmp_path), tmp_path / "runs").manifest)
+    assert needs_ray(plan(write(tmp_path, name="acting", resources={"workers": 1}), tmp_path / "runs").manifest)
+
+
+def test_more_places_than_cores_share_their_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = plan(write(tmp_path), tmp_path / "runs")
+    monkeypatch.setattr(warm, "memory_of_a_core", lambda: 100.0)
+    monkeypatch.setattr(warm, "cores", lambda: 2)
+    found = [LocalExecutor(made.grid, made.manifest, size, lambda: None).memory_mb for size in (1, 2, 4)]
+    assert found == [100.0, 100.0, 50.0]
 
 
 def test_a_place_has_a_cores_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:

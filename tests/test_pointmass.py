@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from space_dist.envs import BatchedPointMass, ContextObservation, ContextVisible, unwrapped
 from space_dist.envs.spec import read_spec
+from tests.one_slot import seen_by
 
 ENV_ID = "space_dist/PointMass-v0"
 LOW, HIGH = np.array([-4.0, 0.5, 0.0]), np.array([4.0, 8.0, 4.0])
@@ -177,15 +178,7 @@ def test_neighbours_and_the_number_of_slots_do_not_matter() -> None:
         env, seeds = BatchedPointMass(n), random.integers(1 << 40, size=n).astype(np.uint64)
         seeds[slot] = 11
         env.reset(np.arange(n), contexts, seeds)
-        told = []
-        for action in actions:
-            everyone = random.normal(0.0, 20.0, size=(n, 2))
-            everyone[slot] = action
-            step = env.step(everyone)
-            told.append((step.observations[slot].tobytes(), float(step.rewards[slot])))
-            if step.terminated[slot]:
-                break
-        return told
+        return seen_by(slot, env, actions, lambda: random.normal(0.0, 20.0, size=(n, 2)))
 
     alone = alone_among(1, 0)
     assert all(alone_among(n, slot) == alone for n, slot in ((2, 1), (8, 3), (33, 32)))

@@ -1,21 +1,16 @@
-"""VDS, ALP-GMM, PLR, learnability, uniform and manual orders: answers worked out by hand."""
+"""VDS, ALP-GMM, learnability, uniform and manual orders: answers worked out by hand."""
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import itertools
-import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from scipy import stats
 from sklearn.mixture import GaussianMixture
 
@@ -26,36 +21,26 @@ from space_dist.curricula import (
     Episodes,
     Feedback,
     Probes,
-    State,
     Uniform,
-    decode_state,
-    encode_state,
 )
-from space_dist.curricula.alp_gmm import AlpGmm, MixtureState, absolute_progress, component_chances, fit_mixture
+from space_dist.curricula.alp_gmm import AlpGmm, absolute_progress, component_chances, fit_mixture
 from space_dist.curricula.configured import Makers
 from space_dist.curricula.draws import effective_size, proportional
 from space_dist.curricula.learnability import Learnability, learnable_chances
-from space_dist.curricula.making import make_curriculum
-from space_dist.curricula.plr import LevelReplay, ReplayState, replay_chances, replayed
 from space_dist.curricula.vds import ValueDisagreement, disagreement
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
-from space_dist.instances import ContextBounds, InstanceSet, read_csv
+from space_dist.instances import InstanceSet, read_csv
 from space_dist.learner import Ensemble, make_learner
-from space_dist.rollout import Episodes as Table
 from space_dist.rollout import Setup, Shard, Worker
-from space_dist.rollout.episodes import mean_sizes
 from space_dist.rollout.policy import EnsemblePolicy, Statistics
 from space_dist.rollout.walk import Walk
-from space_dist.run.building import Blueprint, spec_of
-from space_dist.run.launch import launch
+from space_dist.run.building import Blueprint
 from space_dist.seeding import Purpose, generator
-from space_dist.system.interrupts import StopRequests
-from tests.tiny_env import Line
+from tests.two_features import BOUNDS
 
 ROOT = Path(__file__).resolve().parent.parent
 SPACE = ROOT / "configs/pointmass_space.yaml"
-BOUNDS = ContextBounds(("a", "b"), np.array([0.0, -10.0]), np.array([2.0, 10.0]))
 
 
 def instances(n: int, **columns: Any) -> InstanceSet:
@@ -258,221 +243,6 @@ def test_what_members_see_does_not_depend_on_the_hidden_part_of_the_context() ->
     contexts[1, 0] = 2.0
     one, two = ensemble.policy(Statistics()).values(env.reset(np.arange(2), contexts, np.zeros(2, dtype=np.uint64)))
     assert one.tolist() != two.tolist()
-
-
-# ---- PLR ------------------------------------------------------------------------------------------------------------
-
-
-def test_the_chances_of_replay_by_hand() -> None:
-    scores, staleness = np.array([3.0, 1.0, 2.0, 9.0]), np.array([0, 3, 1, 7])
-    seen, ties = np.array([True, True, True, False]), np.arange(4, dtype=np.uint64)
-    # Ranks 1, 3, 2 with beta 1: 1, 1/3, 1/2, whose sum is 11/6; staleness 0, 3, 1, whose sum is 4.
-    expected = [0.75 * 6 / 11, 0.75 * 2 / 11 + 0.25 * 3 / 4, 0.75 * 3 / 11 + 0.25 / 4, 0.0]
-    np.testing.assert_allclose(replay_chances(scores, staleness, seen, ties, 1.0, 0.25), expected)
-    # Beta 1/2: 1, 1/9, 1/4, whose sum is 49/36. Nothing is stale: a third each.
-    expected = [0.9 * 36 / 49 + 0.1 / 3, 0.9 * 4 / 49 + 0.1 / 3, 0.9 * 9 / 49 + 0.1 / 3, 0.0]
-    np.testing.assert_allclose(replay_chances(scores, 0 * staleness, seen, ties, 0.5, 0.1), expected)
-    # Equal scores are ranked by their keys: the third before the first.
-    tied = replay_chances(np.ones(4), staleness, seen, ties[::-1].copy(), 1.0, 0.0)
-    np.testing.assert_allclose(tied, [2 / 11, 3 / 11, 6 / 11, 0.0])
-
-
-def test_what_was_never_trained_on_comes_first() -> None:
-    plr = LevelReplay(
-        instances(5), seed=0, draws=Draws(20, 2), temperature=0.1, staleness_share=0.1, within_update="fixed_chances"
-    )
-    state, selection = plr.start()
-    heads = in_order(selection)
-    assert sorted(heads[:5]) == [10, 11, 12, 13, 14]
-    trained = heads[:3] - 10
-    told = feedback(0, [*trained, trained[0]], n=5, advantages=[1.0, 3.0, 2.0, 2.0])
-    state, selection, numbers = plr.step(state, told)
-    assert state.scores[trained].tolist() == [1.5, 3.0, 2.0]  # two episodes of the first: their mean
-    assert (state.last[trained].tolist(), state.episodes) == ([3, 1, 2], 4)  # the run's episodes, counted from 0
-    assert (numbers["seen"], numbers["largest_score"]) == (3, 3.0)
-    heads_after = in_order(selection)
-    assert heads_after[:2].tolist() == heads[3:5].tolist()  # still unseen, in the same order
-    assert set(heads_after[2:]) <= set(heads[:3])
-    # Ranks 3, 1, 2, and 0, 2 and 1 episodes since the last: 1 / 10 of 0, 2 / 3 and 1 / 3.
-    by_rank = np.array([3.0, 1.0, 2.0]) ** -10.0
-    expected = 0.9 * by_rank / by_rank.sum() + 0.1 * np.array([0.0, 2.0, 1.0]) / 3.0
-    np.testing.assert_allclose(state.chances[trained], expected)
-    state, selection, _ = plr.step(state, feedback(1, [int(trained[0])], n=5, advantages=9.0))
-    assert state.scores[trained].tolist() == [9.0, 3.0, 2.0]
-    assert state.last[trained].tolist() == [4, 1, 2]
-    assert (in_order(selection)[2:] == 10 + trained[0]).mean() > 0.5  # of the one of the highest score, again and again
-
-
-def in_order(selection: Any, walks: int = 2) -> np.ndarray:
-    """The ids of a selection in the order in which `walks` walks use them."""
-    return selection.ids.reshape(walks, -1).T.ravel()
-
-
-def replayed_by_hand(
-    scores: list[float], last: list[int], episodes: int, uniform: np.ndarray, beta: float, rho: float
-) -> list[int]:
-    """Jiang et al.'s rule, episode for episode, over what was not played yet: fractions instead of cumulative sums."""
-    last, left, played = list(last), [], []
-    for now, (which, point) in enumerate(uniform, start=episodes):
-        left = left or list(range(len(scores)))
-        ranked = sorted(left, key=lambda one: -scores[one])
-        if which < rho:
-            weights = [now - 1 - last[one] for one in ranked]
-            weights = weights if any(weights) else [1.0] * len(ranked)
-        else:
-            weights = [(rank + 1) ** (-1.0 / beta) for rank in range(len(ranked))]
-        shares = itertools.accumulate(weight / math.fsum(weights) for weight in weights)
-        one = next(one for one, below in zip(ranked, shares, strict=True) if point < below)
-        left.remove(one)
-        last[one] = now
-        played.append(one)
-    return played
-
-
-@pytest.mark.parametrize(("beta", "rho"), [(0.1, 0.1), (1.0, 0.3), (0.3, 1.0), (2.0, 0.0)])
-def test_draws_without_repetition_are_the_rule_of_each_episode_over_what_is_left(beta: float, rho: float) -> None:
-    random = np.random.default_rng(0)
-    scores, staleness, uniform = random.random(9), random.permutation(30)[:9], random.random((200, 2))
-    ranked = np.argsort(-scores)
-    found = replayed(ranked, staleness[ranked], uniform, beta, rho)
-    assert found.tolist() == replayed_by_hand(scores.tolist(), (29 - staleness).tolist(), 30, uniform, beta, rho)
-    passes = np.append(found, found[:7]).reshape(-1, 9)[:22]  # 22 whole passes, and the rest of the 200
-    assert (np.sort(passes, axis=1) == np.arange(9)).all()
-
-
-def test_the_first_draw_has_the_papers_chances() -> None:
-    scores, staleness, count = np.array([3.0, 1.0, 2.0, 9.0]), np.array([0, 3, 1, 7]), 4000
-    expected = replay_chances(scores, staleness, np.ones(4, dtype=np.bool_), np.arange(4, dtype=np.uint64), 1.0, 0.25)
-    random, ranked = np.random.default_rng(1).random((count, 1, 2)), np.argsort(-scores)
-    first = np.concatenate([replayed(ranked, staleness[ranked], one, 1.0, 0.25) for one in random])
-    shares = np.bincount(first, minlength=4) / count
-    assert (np.abs(shares - expected) < 5 * np.sqrt(expected * (1 - expected) / count)).all()
-
-
-def test_one_instance_does_not_take_all_episodes_of_an_update_unless_asked_to() -> None:
-    scores = np.array([1.0, 5.0, 4.0, 3.0, 2.0])
-    spreads = {}
-    for rule in ("without_repetition", "fixed_chances"):
-        plr = LevelReplay(
-            instances(5), seed=0, draws=Draws(20, 2), temperature=0.1, staleness_share=0.1, within_update=rule
-        )
-        state, _ = plr.start()
-        state, selection, numbers = plr.step(state, feedback(0, range(5), n=5, advantages=scores))
-        spreads[rule] = numbers["effective_size"]
-        drawn = in_order(selection)
-        if rule == "without_repetition":
-            assert (np.sort(drawn.reshape(4, 5), axis=1) == np.arange(10, 15)).all()
-            uniform = generator(0, Purpose.DRAWS, 1).random((20, 2))
-            by_hand = replayed_by_hand(scores.tolist(), [0, 1, 2, 3, 4], 5, uniform, 0.1, 0.1)
-            assert drawn.tolist() == [10 + one for one in by_hand]
-        else:
-            assert (drawn == 11).mean() > 0.5
-    assert spreads["without_repetition"] == pytest.approx(5.0)
-    assert spreads["fixed_chances"] < 3.0
-    assert configs.load(SPACE, ["curriculum={kind: plr}"]).curriculum.within_update == "without_repetition"
-
-
-@pytest.mark.parametrize("rule", ["without_repetition", "fixed_chances"])
-def test_what_still_runs_is_not_begun_again(rule: Any) -> None:
-    plr = LevelReplay(
-        instances(6), seed=0, draws=Draws(12, 2), temperature=0.1, staleness_share=0.1, within_update=rule
-    )
-    state, selection = plr.start()
-    heads = in_order(selection) - 10
-    # Of the first four that were begun two have ended, the others run on.
-    state, selection, _ = plr.step(state, feedback(0, heads[:2], n=6, advantages=[1.0, 2.0], running=heads[[3, 2, 2]]))
-    assert state.running.tolist() == sorted(heads[2:4])
-    drawn = in_order(selection) - 10
-    assert drawn[:2].tolist() == heads[4:6].tolist()  # unseen, and not running
-    assert set(drawn[2:4]) <= set(heads[:2])
-    if rule == "without_repetition":
-        assert set(drawn[2:4]) == set(heads[:2])  # both before any of those that run
-        assert set(drawn[4:8]) == set(heads[:4])  # then all that were begun, anew
-    # Of all that were begun everything runs: there is nothing else to draw.
-    state, selection, _ = plr.step(state, feedback(1, heads, n=6, advantages=1.0, running=heads))
-    assert set(in_order(selection)) <= set(range(10, 16))
-    if rule == "without_repetition":
-        assert (np.sort(in_order(selection).reshape(2, 6), axis=1) == np.arange(10, 16)).all()
-
-
-def test_every_instance_is_begun_once_before_any_is_begun_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    """Episodes of 100 steps over rounds of 48 a slot: at any time most of what was begun has not ended."""
-    begun, step = [], LevelReplay.step
-
-    def recorded(self: LevelReplay, state: Any, feedback: Feedback) -> Any:
-        assert feedback.episodes is not None
-        ended = [one for episodes in begun[-1:] for one in episodes[0]] + feedback.episodes.indices.tolist()
-        begun.append((ended, feedback.episodes.running.tolist()))
-        return step(self, state, feedback)
-
-    monkeypatch.setattr(LevelReplay, "step", recorded)
-    config = configs.load(SPACE, [
-        "curriculum={kind: plr}", "learner.n_steps=768", "learner.n_epochs=1", "learner.net_arch=[8]",
-        "rollout.slots=8", "rollout.shards=2", "budget.steps=12288", "evaluation.every_steps=100000",
-        "tracking.uri=null", "resources.workers=0",
-    ])  # fmt: skip
-    launch(config, tmp_path / "run", resume=False, stop=StopRequests())
-    counts = [len(ended) + len(running) for ended, running in begun]
-    assert counts[-1] > 100
-    for ended, running in begun:
-        together = [*ended, *running]
-        assert len(together) > 90 or len(set(together)) == len(together)  # the shards do not begin equally many
-
-
-def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:
-    plr = LevelReplay(
-        instances(5), seed=0, draws=Draws(40, 4), temperature=0.1, staleness_share=0.1,
-        within_update="without_repetition",
-    )  # fmt: skip
-    state, selection = plr.start()
-    after, again, numbers = plr.step(state, feedback(0, np.zeros(0, dtype=np.int64), n=5, advantages=0.0))
-    assert (after.version, numbers["seen"], numbers["mean_score"]) == (1, 0, None)
-    assert set(again.ids) == set(selection.ids) == set(range(10, 15))
-
-
-def test_mean_advantages_of_episodes_by_hand() -> None:
-    def shard(slots: list[int], times: list[int], lengths: list[int], starts: list[bool]) -> Any:
-        whole = (np.array(column, dtype=np.int64) for column in (slots, times, lengths))
-        nothing = np.zeros(0)
-        slots_, times_, lengths_ = whole
-        table = Table(np.zeros(len(slots), dtype=np.int64), np.zeros((0, 1)), slots_, times_, lengths_, *[nothing] * 3)
-        return SimpleNamespace(episodes=table, rewards=np.zeros((3, len(starts))), starts=np.array(starts))
-
-    # Slots 0 and 1 are one shard's, slot 2 the other's. Slot 0 goes on with an episode that had 7 in 2 steps, and ends
-    # it and another; slot 1 begins one that runs on; slot 2 goes on with one of 10, which ends at the last step.
-    sizes = np.array([[1.0, 4.0, 2.0], [3.0, 2.0, 3.0], [5.0, 0.5, 4.0]])
-    shards = [shard([0, 0], [0, 2], [3, 2], [False, True]), shard([0], [2], [8], [False])]
-    means, later = mean_sizes(shards, sizes, np.array([7.0, 100.0, 10.0]))
-    assert means.tolist() == [8.0 / 3, 4.0, 19.0 / 8]
-    assert later.tolist() == [0.0, 6.5, 0.0]
-    # The next round: nothing ends, slot 1 goes on, the others begin.
-    shards = [shard([], [], [], [True, False]), shard([], [], [], [True])]
-    means, later = mean_sizes(shards, sizes, later)
-    assert (means.tolist(), later.tolist()) == ([], [9.0, 13.0, 9.0])
-
-
-def test_advantages_are_those_of_generalised_advantage_estimation() -> None:
-    config = vds_config("curriculum={kind: plr}", "learner.gae_lambda=0.5")
-    _, learner, shards = tiny_shards(config)
-    policy, expected = learner.policy(0), []
-    for shard in shards:
-        length, slots = shard.rewards.shape
-        values = policy.values(shard.observations.reshape(-1, 2)).reshape(length, slots)  # type: ignore[union-attr]
-        last, truncated = policy.values(shard.last_observations), policy.values(shard.truncated_observations)
-        behind = {tuple(place): truncated[index] for index, place in enumerate(np.argwhere(shard.truncated))}
-        sizes, advantage = np.zeros((length, slots)), np.zeros(slots)
-        for time in reversed(range(length)):
-            for slot in range(slots):
-                following = last[slot] if time == length - 1 else values[time + 1, slot]
-                ended = (time, slot) in behind
-                delta = shard.rewards[time, slot] + 0.5 * behind.get((time, slot), following) - values[time, slot]
-                advantage[slot] = delta + (0.0 if ended else 0.5 * 0.5 * advantage[slot])
-                sizes[time, slot] = abs(advantage[slot])
-        expected.append(sizes)
-    update = learner.update(shards, round=0, steps=128)
-    np.testing.assert_allclose(update.advantages, np.concatenate(expected, axis=1), atol=1e-4)
 
 
 # ---- learnability ---------------------------------------------------------------------------------------------------
@@ -697,243 +467,3 @@ def test_a_column_of_the_csv_is_read_stored_and_asked_for(tmp_path: Path) -> Non
         read_csv(path, BOUNDS, ("effort",))
     with pytest.raises(ConfigError, match="unknown column 'effort'"):
         read_csv(path, BOUNDS)
-
-
-# ---- all of them ----------------------------------------------------------------------------------------------------
-
-KINDS = {
-    "uniform": "{kind: uniform}",
-    "spdrl": "{kind: spdrl, warm_up: 0, offset: 0}",
-    "spdrl_cg": "{kind: spdrl, warm_up: 0, offset: 0, optimiser: conjugate_gradient}",
-    "vds": "{kind: vds}",
-    "alp_gmm": "{kind: alp_gmm, fit_rate: 12}",
-    "alp_gmm_bounds": "{kind: alp_gmm, fit_rate: 12, over: bounds}",
-    "plr": "{kind: plr}",
-    "learnability": "{kind: learnability, top: 2, every: 2, episodes: 2}",
-    "manual": "{kind: manual, column: effort}",
-}
-
-
-def wide(n: int = 6) -> InstanceSet:
-    """Instances that vary in every direction, so that their covariance is not singular."""
-    contexts = np.random.default_rng(3).uniform(BOUNDS.low, BOUNDS.high, size=(n, 2))
-    return InstanceSet(np.arange(n), contexts, BOUNDS.names, {"effort": np.arange(n, 0.0, -1.0)})
-
-
-def driven(curriculum: Curriculum, train: InstanceSet, steps: int = 4, through: Callable[[State], State] | None = None):
-    """(state, selection, numbers) of a made-up history, each state passed `through` something before it is used."""
-    state, selection = curriculum.start()
-    history: list[Any] = []
-    for version in range(steps):
-        random = np.random.default_rng(version)
-        some = random.choice(len(selection.ids), size=8)
-        ids = selection.ids[some]
-        indices = np.where(ids < 0, -1, np.searchsorted(train.ids, ids))
-        m, n = len(some), len(train)
-        won = feedback(version, [0], n=n).episodes
-        assert won is not None
-        won.success[:] = 1.0
-        probes, asked = None, curriculum.probes(state, won)
-        if asked is not None:
-            success = random.integers(2, size=len(asked)).astype(float)
-            probes = Probes(asked, np.zeros(len(asked)), np.ones(len(asked), dtype=np.int64), success)
-        told = feedback(
-            version, indices, selection.contexts[some], n=n, returns=random.normal(size=m),
-            advantages=random.random(m), members=random.normal(size=(n, 3)), probes=probes,
-        )  # fmt: skip
-        episodes = dataclasses.replace(
-            told.episodes, start_values=random.random(m), discounted_returns=random.random(m)
-        )  # fmt: skip
-        told = dataclasses.replace(told, episodes=episodes)
-        state, selection, numbers = curriculum.step(state if through is None else through(state), told)
-        history.append((state, selection, numbers))
-    return history
-
-
-def plain(history: list[Any]) -> list[Any]:
-    return [
-        ({key: np.asarray(value).tolist() for key, value in vars(state).items()}, selection.ids.tolist(),
-         selection.contexts.tolist(), numbers)
-        for state, selection, numbers in history
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_state_survives_storage_and_the_rows_of_the_file_decide_nothing(kind: str) -> None:
-    train = wide()
-    curriculum = made(KINDS[kind], train)
-
-    def stored(state: State) -> State:
-        arrays, numbers = encode_state(state)
-        file = io.BytesIO()
-        np.savez(file, **arrays)
-        file.seek(0)
-        with np.load(file, allow_pickle=False) as loaded:
-            return decode_state(curriculum.state_type, dict(loaded), json.loads(json.dumps(numbers, allow_nan=False)))
-
-    history = driven(curriculum, train)
-    json.dumps([numbers for _, _, numbers in history], allow_nan=False)
-    assert plain(driven(made(KINDS[kind], train), train, through=stored)) == plain(history)
-    turned = InstanceSet(train.ids[::-1], train.contexts[::-1], train.names, {"effort": train.columns["effort"][::-1]})
-    assert plain(driven(made(KINDS[kind], turned), turned)) == plain(history)
-    for state, selection, _ in history:
-        again = curriculum.selection(state)
-        assert again.ids.tolist() == selection.ids.tolist()
-        assert again.contexts.tolist() == selection.contexts.tolist()
-    other = driven(made(KINDS[kind], train, seed=1), train)
-    if kind != "manual":  # whose order is the file's
-        assert plain(other) != plain(history)
-
-
-def test_every_kind_of_curriculum_is_covered() -> None:
-    # test_curricula, test_curriculum_variants, test_user_curriculum
-    known = {"space", "random_growth", "cspace", "round_robin", "fixed", "custom"}
-    covered = {configs.load(SPACE, [f"curriculum={text}"]).curriculum.kind for text in KINDS.values()}
-    import typing
-
-    union = typing.get_args(configs.RunConfig.model_fields["curriculum"].annotation)
-    kinds = {typing.get_args(section.model_fields["kind"].annotation)[0] for section in union}
-    assert kinds == known | covered
-
-
-@pytest.mark.parametrize(
-    ("curriculum", "words"),
-    [
-        ("{kind: manual, column: effrot}", ["curriculum.column", "train.csv", "'effrot'", "did you mean 'effort'?"]),
-        ("{kind: vds, members_see: [c]}", ["curriculum.members_see", "'c'", "Allowed: a, b"]),
-        ("{kind: learnability, top: 7}", ["curriculum.top: 7", "holds 6 instances"]),
-        ("{kind: learnability, top: 2, candidates: 9}", ["curriculum.candidates: 9", "holds 6 instances"]),
-        ("{kind: spdrl, initial_mean: [1]}", ["curriculum.initial_mean", "1 numbers", "2 features", "(a, b)"]),
-        ("{kind: spdrl, initial_mean: [1, 11]}", ["curriculum.initial_mean", "b = 11", "[-10, 10]"]),
-    ],
-)
-def test_what_instances_or_environment_do_not_have_is_refused(curriculum: str, words: list[str]) -> None:
-    with pytest.raises(ConfigError) as refusal:
-        made(curriculum, wide())
-    assert all(word in str(refusal.value) for word in words), str(refusal.value)
-
-
-def test_moments_of_a_set_on_a_line_are_refused() -> None:
-    for train in (instances(4), instances(1)):
-        with pytest.raises(ConfigError, match=r"curriculum\.target: set_moments .* singular\. Use target: normal"):
-            made("{kind: spdrl}", train)
-
-
-def test_the_moments_of_the_set_are_the_target() -> None:
-    train = wide(40)
-    numbers = driven(made("{kind: spdrl}", train), train, 1)[0][2]
-    assert numbers["target_mean_b"] == pytest.approx(train.contexts[:, 1].mean())
-    assert numbers["target_std_b"] == pytest.approx(train.contexts[:, 1].std())
-    assert numbers["mean_a"] == 1.0  # by default, from the middle of the bounds
-    assert numbers["std_b"] == 5.0  # and a quarter of their width
-
-
-@pytest.mark.parametrize(
-    ("curriculum", "words"),
-    [
-        ("{kind: spdrl, target: normal}", "target: normal needs target_mean and target_std"),
-        ("{kind: spdrl, target_std: [1]}", "say nothing with target: set_moments"),
-        ("{kind: alp_gmm, fit_rate: 5}", "fit_rate must be at least components"),
-        ("{kind: spdrl, initial_std: [0]}", "initial_std"),
-        ("{kind: plr, temperature: 0}", "temperature"),
-        ("{kind: manual}", "curriculum.column: this key is required"),
-        ("{kind: space, pic: random, reverse: true}", "reverse: true changes nothing with pic: random"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(curriculum: str, words: str) -> None:
-    with pytest.raises(ConfigError) as refusal:
-        configs.load(SPACE, [f"curriculum={curriculum}"])
-    assert words in str(refusal.value)
-
-
-def set_up(*overrides: str) -> None:
-    config = configs.load(SPACE, list(overrides))
-    spec = spec_of(config)
-    bounds = spec.context_bounds
-    middle = (bounds.low + bounds.high) / 2.0
-    contexts = middle + np.linspace(-0.1, 0.1, 30)[:, None] * np.random.default_rng(0).random((30, len(middle)))
-    train = InstanceSet(np.arange(30), contexts, bounds.names)
-    Blueprint(config, spec).setup(train, InstanceSet(np.array([99]), middle[None], bounds.names))
-
-
-class Silent(Line):
-    """The line of `tests.tiny_env`, which does not say whether it succeeded."""
-
-    def step(self, actions: Any) -> Any:
-        return dataclasses.replace(super().step(actions), success=None)
-
-
-def make_silent(n_slots: int) -> Silent:
-    return Silent(n_slots, spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["curriculum={kind: plr}", "env.id=tests.tiny_env:make_discrete", "learner={kind: dqn, n_steps: 2048}"],
-         "plr scores episodes by their advantages, which learner.kind: dqn does not compute. Allowed learners: ppo"),
-        (["curriculum={kind: learnability}", "env.id=tests.test_rivals:make_silent"],
-         "needs to know whether an episode succeeded"),
-        (["curriculum={kind: vds}", "env.context_visible=false"], "vds ranks instances by the value of their start"),
-        (["curriculum={kind: spdrl}", "env.context_visible=false"], "or curriculum.allow_context_blind: true"),
-        (["curriculum={kind: vds, members_see: [gate_x]}", "env.context_visible=false"], "context_visible: true"),
-        (["curriculum={kind: vds}", "env.id=tests.tiny_env:make_dict", "learner.policy=MultiInputPolicy"],
-         "vds needs flat observations"),
-    ],
-)  # fmt: skip
-def test_what_learner_or_environment_cannot_give_is_refused(overrides: list[str], words: str) -> None:
-    with pytest.raises(ConfigError) as refusal:
-        set_up(*overrides)
-    assert words in str(refusal.value)
-
-
-def test_shipped_rivals_can_be_made() -> None:
-    folder = ROOT / "configs/curricula"
-    for path in sorted(folder.glob("*.yaml")):
-        config = configs.load(path)
-        assert path.stem == config.name
-        if config.env.id == "space_dist/PointMass-v0":
-            bounds = spec_of(config).context_bounds
-            make_curriculum(config, read_csv(config.instances.train, bounds), bounds).start()
-
-
-def test_contexts_of_instances_are_worth_what_their_start_values_say() -> None:
-    config = vds_config()
-    worker, learner, _ = tiny_shards(config)
-    policy = learner.policy(0)
-    found = worker.context_values(policy, worker._setup.train.contexts, version=3)
-    assert found.tobytes() == worker.context_values(policy, worker._setup.train.contexts, version=3).tobytes()
-    # The line's starts are random within 0.1 of 0, and the value of a fresh network hardly depends on that.
-    np.testing.assert_allclose(found, worker.start_values(policy, 0), atol=0.3)
-    still = configs.load(SPACE)
-    spec = spec_of(still)
-    bounds = spec.context_bounds
-    train, test = (read_csv(path, bounds) for path in (still.instances.train, still.instances.test))
-    point = Worker(Blueprint(still, spec).setup(train, test))
-    policy = make_learner(
-        still.learner, spec.observation_space, spec.action_space, seed=0, n_slots=16, slot_length=128, total_steps=2048
-    ).policy(0)
-    values = point.context_values(policy, train.contexts[:7], version=0)
-    np.testing.assert_allclose(values, point.start_values(policy, 0)[:7], atol=1e-6)
-
-
-def test_probes_act_with_noise_on_the_instances_asked_for() -> None:
-    config = vds_config()
-    worker, learner, _ = tiny_shards(config)
-    policy, indices = learner.policy(0), np.repeat([0, 2], 4)
-    parts = [worker.probe(policy, indices, 5, part) for part in range(2)]
-    assert [part.lengths.tolist() for part in parts] == [[8] * 4, [8] * 4]
-    assert len(set(parts[0].returns)) == 4  # the same instance, other noise
-    again = Worker(worker._setup).probe(policy, indices, 5, 1)
-    assert again.returns.tobytes() == parts[1].returns.tobytes()
-    assert worker.probe(policy, indices, 6, 1).returns.tobytes() != parts[1].returns.tobytes()
-
-
-def test_states_are_plain() -> None:
-    for kind, text in KINDS.items():
-        state = made(text, wide()).start()[0]
-        assert isinstance(state, State)
-        for name, value in vars(state).items():
-            assert value is None or isinstance(value, int | float | np.ndarray), (kind, name)
-    assert isinstance(made(KINDS["plr"], wide()).start()[0], ReplayState)
-    assert isinstance(made(KINDS["alp_gmm"], wide()).start()[0], MixtureState)

@@ -6,13 +6,14 @@ import contextlib
 import dataclasses
 import gzip
 import hashlib
+import itertools
 import logging
 import shutil
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,19 @@ def histories(uri: str, run: Run) -> dict[str, list[tuple[int, int, float]]]:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def stop_in(last: int, events: Mapping[int, Callable[[], object]]) -> Callable[[], bool]:
+    """For `follow`: what happens in some of its rounds, counted from 1, and that it stops in the last one."""
+    rounds = itertools.count(1)
+
+    def stop() -> bool:
+        now = next(rounds)
+        if now in events:
+            events[now]()
+        return now >= last
+
+    return stop
 
 
 def test_a_finished_run_is_mirrored_whole_and_once(uri: str, tmp_path: Path) -> None:
@@ -353,22 +367,12 @@ def test_a_deleted_experiment_is_refused(uri: str, tmp_path: Path) -> None:
 
 def test_following_picks_up_runs_and_rows_as_they_come(uri: str, tmp_path: Path) -> None:
     root, ledger = tmp_path / "runs", Ledger(tmp_path / "runs/s0")
-    events = iter(
-        [
-            lambda: None,  # no run yet: not even the folder
-            lambda: start_run(ledger.folder, uri=uri),
-            lambda: continue_run(ledger, TEST, GROWTH, until=2, state="interrupted"),
-            lambda: continue_run(ledger, TEST, GROWTH),
-        ]
-    )
-
-    def stop() -> bool:
-        event = next(events, None)
-        if event is not None:
-            event()
-        return event is None
-
-    result = follow(root, poll_seconds=0.0, stop=stop)
+    events = {  # at first there is no run: not even the folder
+        2: lambda: start_run(ledger.folder, uri=uri),
+        3: lambda: continue_run(ledger, TEST, GROWTH, until=2, state="interrupted"),
+        4: lambda: continue_run(ledger, TEST, GROWTH),
+    }
+    result = follow(root, poll_seconds=0.0, stop=stop_in(5, events))
     assert (result.runs, result.created, result.rows) == (1, 1, 9)
     assert only_run(uri).info.status == "FINISHED"
     assert len(histories(uri, only_run(uri))["test/return"]) == 5
@@ -381,18 +385,13 @@ def test_following_says_once_that_the_store_is_away_and_once_that_it_is_back(
     database, away = Path(uri.removeprefix("sqlite:///")), tmp_path / "away.db"
     database.rename(away)
     database.mkdir()
-    calls = 0
 
-    def stop() -> bool:
-        nonlocal calls
-        calls += 1
-        if calls == 4:
-            database.rmdir()
-            away.rename(database)
-        return calls == 6
+    def come_back() -> None:
+        database.rmdir()
+        away.rename(database)
 
     with caplog.at_level(logging.WARNING, logger="space_dist.tracking"):
-        follow(tmp_path / "runs", uri, "tests", poll_seconds=0.0, stop=stop)
+        follow(tmp_path / "runs", uri, "tests", poll_seconds=0.0, stop=stop_in(6, {4: come_back}))
     first, second = (record.getMessage() for record in caplog.records if record.name == "space_dist.tracking")
     assert "Nothing is lost" in first
     assert "reached again" in second

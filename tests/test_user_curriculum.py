@@ -1,88 +1,38 @@
 """Anyone's own curriculum, by import path: the example in the documentation, the same bytes wherever it is made."""
 
+# ruff: noqa: F811 - a fixture that is imported
 from __future__ import annotations
 
-import functools
-import os
 import re
-import signal
-import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from space_dist import cli
-from space_dist import config as configs
-from space_dist.cli import runs
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.grid.planning import plan
-from space_dist.ledger import CURRICULUM, METRICS, Ledger, RunWriter
+from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
-from tests import prepared
-from tests.patience import PATIENCE
-from tests.test_learners import interrupted
+from tests.commanding import command
+from tests.own_code import Example, example  # noqa: F401
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "your_curriculum.md"
-RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
-QUICK = [
-    "budget.steps=4096", "learner.n_steps=256", "learner.n_epochs=1", "evaluation.every_steps=4096",
-    "checkpoint.every_rounds=1", "tracking.uri=null",
-]  # fmt: skip
-ROUNDS = 16
-CONFIG = Path("my_curriculum.yaml")
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(runs, "STOP", StopRequests())
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
-
-
-@pytest.fixture
-def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A current folder that holds what the documentation shows, and instances."""
-    (code,), (config,) = blocks("python"), blocks("yaml")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    Path("my_curriculum.py").write_text(code)
-    CONFIG.write_text(config)
-    sample = blocks("bash")[0].splitlines()[0].split()[1:]
-    assert command(monkeypatch, *sample, "--train", 12, "--test", 3) == 0
-    yield tmp_path
-    sys.modules.pop("my_curriculum", None)
-
-
-def chosen(*settings: str, workers: int = 0) -> configs.RunConfig:
-    return configs.load(CONFIG, [*QUICK, f"resources.workers={workers}", *settings])
-
-
-def trained(folder: Path, *settings: str, workers: int = 0) -> dict[str, bytes]:
-    launch(chosen(*settings, workers=workers), folder, resume=True, stop=StopRequests())
-    return {name: (folder / name).read_bytes() for name in RESULTS}
+EXAMPLE = Example(
+    "your_curriculum.md", "my_curriculum", rounds=16,
+    quick=("budget.steps=4096", "learner.n_steps=256", "learner.n_epochs=1", "evaluation.every_steps=4096",
+           "checkpoint.every_rounds=1", "tracking.uri=null"),
+)  # fmt: skip
+chosen, trained = EXAMPLE.chosen, EXAMPLE.trained
 
 
 def test_the_example_in_the_documentation_is_short_and_works(
     example: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert len((example / "my_curriculum.py").read_text().splitlines()) <= 45
-    _, check, train = (line.partition("#")[0].split()[1:] for line in blocks("bash")[0].splitlines())
+    _, check, train = (line.partition("#")[0].split()[1:] for line in EXAMPLE.blocks("bash")[0].splitlines())
     capsys.readouterr()
     assert command(monkeypatch, *check) == 0
     assert "my_curriculum:Lagging: no fault found in 30 decisions on 12 instances" in capsys.readouterr().out
-    quick = [part for setting in (*QUICK, "resources.workers=0") for part in ("--set", setting)]
+    quick = [part for setting in (*EXAMPLE.quick, "resources.workers=0") for part in ("--set", setting)]
     assert command(monkeypatch, *train, "--out", "run", *quick) == 0, capsys.readouterr().err
     rows = [row for row in Ledger(Path("run")).rows() if row["kind"] == "iteration"]
     assert {row["curriculum"]["size"] for row in rows if row["complete"]} == {3}  # a quarter of twelve
@@ -100,34 +50,7 @@ def test_neither_workers_nor_a_kill_change_a_byte(example: Path) -> None:
     reference = trained(example / "reference")
     for workers in (1, 2):
         assert trained(example / f"workers{workers}", workers=workers) == reference
-    folder = example / "killed"
-    arguments = ["train", CONFIG, "--out", folder, "--workers", 0]
-    arguments += [part for setting in QUICK for part in ("--set", setting)]
-    victim = prepared.command(arguments, example / "said.txt", functools.partial(_slowly, str(example)))
-    deadline = time.monotonic() + PATIENCE
-    while len(list((folder / "checkpoints").glob("round-*.npz"))) < 2:
-        assert victim.is_alive(), (example / "said.txt").read_text()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert victim.pid is not None
-    os.kill(victim.pid, signal.SIGKILL)
-    victim.join(PATIENCE)
-    status = Ledger(folder).status()
-    assert (status.state, 0 < status.round < ROUNDS) == ("running", True)
-    assert trained(folder) == reference
-    assert not Ledger(folder).status().fingerprint_changed
-
-
-def _slowly(folder: str) -> None:
-    """In that folder, and with time after each commit to be killed in."""
-    os.chdir(folder)
-    commit = RunWriter.commit
-
-    def resting(self: RunWriter, *arguments: object) -> None:
-        commit(self, *arguments)  # type: ignore[arg-type]
-        time.sleep(0.5)
-
-    RunWriter.commit = resting  # type: ignore[method-assign, assignment]
+    EXAMPLE.assert_a_kill_changes_no_byte(example, reference)
 
 
 def test_seed_and_arguments_decide(example: Path) -> None:
@@ -137,22 +60,7 @@ def test_seed_and_arguments_decide(example: Path) -> None:
 
 
 def test_its_source_is_part_of_what_a_run_is(example: Path) -> None:
-    grid, module = example / "grid.yaml", example / "my_curriculum.py"
-    grid.write_text(
-        f"name: mine\nextends: {CONFIG}\nset: {{budget.steps: 2048}}\nzip: {{learner.n_epochs: [1]}}\n"
-        "seeds: {start: 0, count: 1}\ntracking: {uri: null}\n"
-    )
-    planned = plan(grid, example / "runs")
-    interrupted(chosen(), example / "run", 3)
-    before = Ledger(example / "run").status()
-    assert "source.my_curriculum" in before.fingerprint
-    assert plan(grid, example / "runs").new_runs == 0
-    module.write_text(module.read_text() + "\n# edited\n")
-    again = plan(grid, example / "runs")
-    assert (planned.new_runs, again.new_runs, again.dropped_runs) == (1, 1, 1)
-    launch(chosen(), example / "run", resume=True, stop=StopRequests())
-    assert Ledger(example / "run").status().fingerprint_changed
-    assert "that of your own environment, policy, learner or curriculum" in (example / "run/log.txt").read_text()
+    EXAMPLE.assert_its_source_is_part_of_a_run(example)
 
 
 def test_columns_of_the_instances_reach_it(example: Path) -> None:

@@ -22,8 +22,9 @@ from space_dist.ledger import Ledger
 from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
 from tests.faulty_env import HORIZON, Honest
+from tests.own_code import blocks
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "your_environment.md"
+PAGE = "your_environment.md"
 HONEST = "tests.faulty_env:Honest"
 
 
@@ -172,14 +173,10 @@ def test_half_a_step_of_a_whole_number_is_refused() -> None:
 # ---- the command line, and the example ----
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
-
-
 def test_the_example_in_the_documentation_is_short_and_works(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    (code,), (config,), (commands,) = blocks("python"), blocks("yaml"), blocks("bash")
+    (code,), (config,), (commands,) = (blocks(PAGE, language) for language in ("python", "yaml", "bash"))
     assert len(code.splitlines()) < 40
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))

@@ -1,83 +1,35 @@
 """Anyone's own learner, by import path: the example in the documentation, the same bytes wherever it goes on."""
 
+# ruff: noqa: F811 - a fixture that is imported
 from __future__ import annotations
 
-import functools
-import os
 import re
-import signal
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from space_dist import cli
 from space_dist import config as configs
-from space_dist.cli import runs
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.grid.planning import plan
-from space_dist.ledger import CURRICULUM, METRICS, Ledger, RunWriter
+from space_dist.ledger import Ledger
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.sb3.export import export_sb3
 from space_dist.system.interrupts import StopRequests
-from tests import prepared
-from tests.patience import PATIENCE
-from tests.test_learners import interrupted
+from tests.commanding import command
+from tests.own_code import Example, example  # noqa: F401
+from tests.test_learners import RESULTS, interrupted, results
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "your_learner.md"
-RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
-QUICK = [
-    "budget.steps=2048", "learner.n_steps=256", "learner.n_epochs=1", "evaluation.every_steps=2048",
-    "checkpoint.every_rounds=1", "tracking.uri=null",
-]  # fmt: skip
-ROUNDS = 8
-CONFIG = Path("my_learner.yaml")
+EXAMPLE = Example(
+    "your_learner.md", "my_learner", rounds=8,
+    quick=("budget.steps=2048", "learner.n_steps=256", "learner.n_epochs=1", "evaluation.every_steps=2048",
+           "checkpoint.every_rounds=1", "tracking.uri=null"),
+)  # fmt: skip
+chosen, trained = EXAMPLE.chosen, EXAMPLE.trained
 OFF_POLICY = ["budget.steps=1024", "evaluation.every_steps=1024", "checkpoint.every_rounds=1", "tracking.uri=null",
               "resources.workers=0"]  # fmt: skip
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, arguments)])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(runs, "STOP", StopRequests())
-    try:
-        cli.main()
-    except SystemExit as error:
-        return int(error.code or 0)
-    return 0
-
-
-@pytest.fixture
-def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A current folder that holds what the documentation shows, and instances."""
-    (code,), (config,) = blocks("python"), blocks("yaml")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    Path("my_learner.py").write_text(code)
-    CONFIG.write_text(config)
-    sample = blocks("bash")[0].splitlines()[0].split()[1:]
-    assert command(monkeypatch, *sample, "--train", 12, "--test", 3) == 0
-    yield tmp_path
-    for module in ("my_learner", "others"):
-        sys.modules.pop(module, None)
-
-
-def chosen(*settings: str, workers: int = 0) -> configs.RunConfig:
-    return configs.load(CONFIG, [*QUICK, f"resources.workers={workers}", *settings])
-
-
-def trained(folder: Path, *settings: str, workers: int = 0) -> dict[str, bytes]:
-    launch(chosen(*settings, workers=workers), folder, resume=True, stop=StopRequests())
-    return {name: (folder / name).read_bytes() for name in RESULTS}
 
 
 def written(folder: Path, code: str) -> None:
@@ -101,8 +53,8 @@ def test_the_example_in_the_documentation_is_short_and_works(
     example: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert len((example / "my_learner.py").read_text().splitlines()) <= 30
-    (train,) = (line.split()[1:] for line in blocks("bash")[0].splitlines()[1:])
-    quick = [part for setting in (*QUICK, "resources.workers=0") for part in ("--set", setting)]
+    (train,) = (line.split()[1:] for line in EXAMPLE.blocks("bash")[0].splitlines()[1:])
+    quick = [part for setting in (*EXAMPLE.quick, "resources.workers=0") for part in ("--set", setting)]
     assert command(monkeypatch, *train, "--out", "run", *quick) == 0, capsys.readouterr().err
     rows = [row["learner"] for row in Ledger(Path("run")).rows() if row["kind"] == "iteration"]
     coefficients = [row["ent_coef"] for row in rows]
@@ -117,54 +69,12 @@ def test_the_example_in_the_documentation_is_short_and_works(
 def test_neither_workers_nor_a_kill_change_a_byte(example: Path) -> None:
     reference = trained(example / "reference")
     assert trained(example / "workers", workers=2) == reference
-    folder = example / "killed"
-    arguments = ["train", CONFIG, "--out", folder, "--workers", 0]
-    arguments += [part for setting in QUICK for part in ("--set", setting)]
-    victim = prepared.command(arguments, example / "said.txt", functools.partial(_slowly, str(example)))
-    deadline = time.monotonic() + PATIENCE
-    while len(list((folder / "checkpoints").glob("round-*.npz"))) < 2:
-        assert victim.is_alive(), (example / "said.txt").read_text()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert victim.pid is not None
-    os.kill(victim.pid, signal.SIGKILL)
-    victim.join(PATIENCE)
-    status = Ledger(folder).status()
-    assert (status.state, 0 < status.round < ROUNDS) == ("running", True)
-    assert trained(folder) == reference
-    assert not Ledger(folder).status().fingerprint_changed
-
-
-def _slowly(folder: str) -> None:
-    """In that folder, and with time after each commit to be killed in."""
-    os.chdir(folder)
-    commit = RunWriter.commit
-
-    def resting(self: RunWriter, *arguments: object) -> None:
-        commit(self, *arguments)  # type: ignore[arg-type]
-        time.sleep(0.5)
-
-    RunWriter.commit = resting  # type: ignore[method-assign, assignment]
+    EXAMPLE.assert_a_kill_changes_no_byte(example, reference)
 
 
 def test_its_arguments_and_its_source_are_part_of_what_a_run_is(example: Path) -> None:
-    grid, module = example / "grid.yaml", example / "my_learner.py"
-    grid.write_text(
-        f"name: mine\nextends: {CONFIG}\nset: {{budget.steps: 2048}}\nzip: {{learner.n_epochs: [1]}}\n"
-        "seeds: {start: 0, count: 1}\ntracking: {uri: null}\n"
-    )
-    planned = plan(grid, example / "runs")
-    interrupted(chosen(), example / "run", 3)
-    before = Ledger(example / "run").status()
-    assert "source.my_learner" in before.fingerprint
     assert configs.identity(chosen("learner.kwargs.target=0.25"), "", "") != configs.identity(chosen(), "", "")
-    assert plan(grid, example / "runs").new_runs == 0
-    module.write_text(module.read_text() + "\n# edited\n")
-    again = plan(grid, example / "runs")
-    assert (planned.new_runs, again.new_runs, again.dropped_runs) == (1, 1, 1)
-    launch(chosen(), example / "run", resume=True, stop=StopRequests())
-    assert Ledger(example / "run").status().fingerprint_changed
-    assert "environment, policy, learner or curriculum" in (example / "run/log.txt").read_text()
+    EXAMPLE.assert_its_source_is_part_of_a_run(example)
 
 
 BESIDE = """
@@ -214,7 +124,7 @@ class Mine(SAC):
 def off_policy() -> configs.RunConfig:
     learner = ("learner={kind: sac, import: 'others:Mine', n_steps: 128, net_arch: [16], learning_starts: 50, "
                "gradient_steps_per_step: 0.1}")  # fmt: skip
-    return configs.load(CONFIG, [*OFF_POLICY, learner])
+    return configs.load(EXAMPLE.config, [*OFF_POLICY, learner])
 
 
 def test_what_it_keeps_beside_its_policy_survives_a_checkpoint(example: Path) -> None:
@@ -326,9 +236,9 @@ def test_a_class_of_each_kind_that_changes_nothing_has_the_bits_of_the_stock_one
     found: list[Any] = []
     for own in ("null", "others:Mine"):
         settings = f"learner={{kind: {kind}, import: {own}, n_steps: 256, net_arch: [16]}}"
-        config = configs.load(CONFIG, [*OFF_POLICY, settings])
+        config = configs.load(EXAMPLE.config, [*OFF_POLICY, settings])
         launch(config, example / own, resume=False, stop=StopRequests())
-        found.append({name: (example / own / name).read_bytes() for name in RESULTS})
+        found.append(results(example / own))
     assert found[0] == found[1]
 
 

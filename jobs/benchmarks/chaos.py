@@ -38,6 +38,7 @@ from rich.table import Table
 
 from benchmarks.faults import KINDS, LAST, OF_ALL, Fault, Hit, Result, plan
 from benchmarks.processes import MARK, in_words, is_hit, is_live, is_named, left_of_ours, marked
+from benchmarks.results import JsonFile, keep
 from benchmarks.servers import RayHead, TrackingServer, until
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError, nearest
@@ -72,7 +73,7 @@ def chaos(
     seed: Annotated[int, typer.Option(min=0, help="Of kinds, moments and victims.")] = 0,
     kind: Annotated[Optional[list[str]], typer.Option(help="Only these kinds of faults; repeatable.")] = None,  # noqa: UP045
     population: Annotated[bool, typer.Option(help="Runs share their processes (engine: population).")] = False,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """Faults over a grid on Ray and MLflow: recovered, results identical, nothing lost, doubled or left behind."""
     if unknown := sorted({*(kind or ())} - {*KINDS}):
@@ -84,8 +85,7 @@ def chaos(
         runs=runs, steps=steps, seed=seed, kinds=kind or possible, count=faults, say=console.print, settings=settings
     )
     _show(result)
-    if json_file is not None:
-        json_file.write_text(json.dumps(asdict(result), indent=1) + "\n")
+    keep(asdict(result), json_file)
     if result.faults:
         raise typer.Exit(1)
 

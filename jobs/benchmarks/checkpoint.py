@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.results import JsonFile, keep, refuse_if
 from space_dist import config as configs
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
@@ -35,7 +35,7 @@ RUNS = {
 
 def checkpoint(
     repeats: Annotated[int, typer.Option(min=1, help="Pairs of runs of each kind.")] = 1,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """What checkpoints cost at the default interval, as a share of a run's wall time; a full replay buffer included."""
     table = Table(title="Checkpointing at the default interval")
@@ -63,11 +63,8 @@ def checkpoint(
         "The share is the time inside commits and pieces of the replay buffer, less that of the one commit of its twin "
         "that makes none on the way: the difference of two wall times would be noise."
     )
-    if json_file is not None:
-        json_file.write_text(json.dumps(rows, indent=1) + "\n")
-    if exceeded:
-        console.print("A limit is exceeded.", style="red")
-        raise typer.Exit(1)
+    keep(rows, json_file)
+    refuse_if(exceeded, console)
 
 
 def _seconds(name: str, settings: list[str]) -> tuple[float, int, float]:

@@ -7,10 +7,8 @@ seeds the IQM is the plain mean, so there the population's mean is what an inter
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -19,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy import special, stats
 
+from benchmarks.results import JsonFile, keep
 from space_dist.report.statistics import (
     CONFIDENCE,
     Interval,
@@ -112,7 +111,7 @@ METHODS: Final[Mapping[str, Callable[[FloatArray], Bounds]]] = {
 
 def coverage(
     samples: Annotated[int, typer.Option(min=100, help="Drawn from each population.")] = 2000,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """How often 95 % intervals cover, by population and number of seeds; those of reports, and others."""
     parts = {
@@ -129,8 +128,7 @@ def coverage(
             table.add_row(*(f"{cell[0]:.1f} ({cell[1]:.2f})" if isinstance(cell, tuple) else str(cell)
                             for cell in row.values()))  # fmt: skip
         console.print(table)
-    if json_file is not None:
-        json_file.write_text(json.dumps(parts, indent=1) + "\n")
+    keep(parts, json_file)
 
 
 def of_one_cell(samples: int) -> Iterable[dict[str, Any]]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -18,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.curriculum import ppo_update_seconds
 from benchmarks.measure import duration
+from benchmarks.results import JsonFile, keep, refuse_if
 from space_dist import config as configs
 from space_dist.envs.distributions import sample
 from space_dist.instances import InstanceSet
@@ -51,7 +51,7 @@ KINDS = {
 
 def curricula(
     iterations: Annotated[int, typer.Option(min=5, help="Iterations of each; the mean counts.")] = 30,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """What each curriculum costs beside round robin with 100 instances, as a share of one PPO update."""
     import sklearn.mixture  # noqa: F401 - a second, which ALP-GMM pays once a run and not once an iteration
@@ -81,11 +81,8 @@ def curricula(
         "Decide: the curriculum's step and its draws, with ALP-GMM's fit whenever one is due. Own optimisation: VDS's "
         "ensemble and SPDRL's search. Learnability's probes are environment steps, which the budget is charged."
     )
-    if json_file is not None:
-        json_file.write_text(json.dumps(rows, indent=1) + "\n")
-    if any(row["share"] > row["limit"] for row in rows):
-        console.print("A limit is exceeded.", style="red")
-        raise typer.Exit(1)
+    keep(rows, json_file)
+    refuse_if(any(row["share"] > row["limit"] for row in rows), console)
 
 
 class _Timed(InProcess):

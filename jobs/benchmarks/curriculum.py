@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -14,6 +13,7 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import duration, median, median_cpu
+from benchmarks.results import JsonFile, keep, refuse_if
 from space_dist import config as configs
 from space_dist.curricula import SetState
 from space_dist.envs.distributions import sample
@@ -31,7 +31,7 @@ LIMITS = {100: 0.001, 1_600: 0.002, 100_000: 0.05, 1_000_000: 0.5}
 
 def curriculum(
     repeats: Annotated[int, typer.Option(min=3, help="Measurements of each; the median counts.")] = 7,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """What SPaCE costs: revaluing and selecting among N instances, as a share of one PPO update."""
     threadpool_limits(limits=1)
@@ -60,11 +60,8 @@ def curriculum(
         "Selecting is timed with the whole set selected, where it costs most. Transport: wall time of the same "
         "decision through one rollout actor and the curriculum actor, less the CPU time of the work itself."
     )
-    if json_file is not None:
-        json_file.write_text(json.dumps(rows, indent=1) + "\n")
-    if any(row["share"] > row["limit"] for row in rows):
-        console.print("A limit is exceeded.", style="red")
-        raise typer.Exit(1)
+    keep(rows, json_file)
+    refuse_if(any(row["share"] > row["limit"] for row in rows), console)
 
 
 def ppo_update_seconds(config: configs.RunConfig, repeats: int) -> float:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from benchmarks.results import JsonFile, keep
 from space_dist.envs import make_batched, pointmass
 from space_dist.envs.distributions import sample
 
@@ -64,13 +63,12 @@ def envs(
     resets: Annotated[
         int, typer.Option(min=0, help="Instead: reset each PyBullet environment so often and watch the memory.")
     ] = 0,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """How fast the environments step, each beside the obvious alternative; or with --resets, whether they leak."""
     threadpool_limits(limits=1)
     found = leaks(resets) if resets else rates(repeats)
-    if json_file is not None:
-        json_file.write_text(json.dumps(found, indent=1) + "\n")
+    keep(found, json_file)
     if not all(row["kept"] for row in found):
         console.print("A limit is not kept.", style="red")
         raise typer.Exit(1)

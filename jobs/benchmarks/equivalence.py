@@ -10,7 +10,6 @@ promise too much. The pilot is a population, which costs a minute, and its seeds
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
+from benchmarks.results import JsonFile, keep
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
 from space_dist.experiment.manifest import Grid
@@ -71,7 +71,7 @@ def equivalence(
         typer.Option(help="Keep the runs here; what is done stays."),
     ] = None,
     max_parallel: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 2,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """TOST: the population engine against SB3 on PointMass."""
     with tempfile.TemporaryDirectory() as temporary:
@@ -100,10 +100,9 @@ def equivalence(
     console.print(table)
     if seeds > MOST:
         console.print(f"Only {MOST} of the {seeds} seeds were run: the power is lower.", style="red")
-    if json_file is not None:
-        numbers = {"margin": margin, "pilot_std": spread, "seeds": count, "seeds_needed": seeds,
-                   **asdict(found), "equivalent": found.equivalent}  # fmt: skip
-        json_file.write_text(json.dumps(numbers, indent=1) + "\n")
+    numbers = {"margin": margin, "pilot_std": spread, "seeds": count, "seeds_needed": seeds,
+               **asdict(found), "equivalent": found.equivalent}  # fmt: skip
+    keep(numbers, json_file)
     if not found.equivalent:
         raise typer.Exit(1)
 

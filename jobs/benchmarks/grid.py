@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,12 +9,13 @@ import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.results import JsonFile, keep
 from benchmarks.servers import RayHead
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
@@ -28,7 +28,7 @@ console = Console()
 
 def grid(
     runs: Annotated[int, typer.Option(min=2, help="Short runs of 20,480 PointMass steps.")] = 16,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """Wall time of short runs: a warm pool of two workers against one Ray job a run, two at a time."""
     with ExitStack() as stack:
@@ -50,8 +50,7 @@ def grid(
         table.add_row(name, f"{seconds[mode]:.1f} s", f"{seconds[mode] / seconds['jobs']:.0%}")
     console.print(table)
     console.print(f"at most {LIMIT:.0%} is wanted")
-    if json_file is not None:
-        json_file.write_text(json.dumps({**seconds, "ratio": ratio, "limit": LIMIT}) + "\n")
+    keep({**seconds, "ratio": ratio, "limit": LIMIT}, json_file)
     if ratio > LIMIT:
         console.print("The limit is exceeded.", style="red")
         raise typer.Exit(1)

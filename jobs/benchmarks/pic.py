@@ -8,7 +8,6 @@ policy truly has there.
 from __future__ import annotations
 
 import itertools
-import json
 import multiprocessing
 import tempfile
 import warnings
@@ -16,7 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -24,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import spearmanr
 
+from benchmarks.results import JsonFile, keep
 from space_dist import config as configs
 from space_dist.ledger import METRICS, Ledger, RunWriter, Status
 from space_dist.rollout import FloatArray, IntArray, Split, joined
@@ -88,7 +88,7 @@ def pic(
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each way to rank.")] = 3,
     steps: Annotated[int, typer.Option(min=10_240, help="Environment steps of a run.")] = 102_400,
     processes: Annotated[int, typer.Option(min=1, help="Runs at a time. Decides no result.")] = 2,
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """What SPaCE's ranking measures on PointMass: values against true returns, and what each ranking comes to."""
     asked = [(rank, seed, steps) for seed in range(seeds) for rank in RANKS]
@@ -105,8 +105,7 @@ def pic(
         table.add_row(words, *(_shown(row[name]) for row in rows))
     console.print(table)
     console.print(_WORDS, highlight=False, soft_wrap=True)
-    if json_file is not None:
-        json_file.write_text(json.dumps(rows, indent=1) + "\n")
+    keep(rows, json_file)
 
 
 _MEASURES = {

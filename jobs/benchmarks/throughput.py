@@ -21,6 +21,7 @@ import typer
 from rich.console import Console
 
 from benchmarks.contenders import TASKS, XLA_FLAGS, Contender, specification
+from benchmarks.results import JsonFile, keep
 from space_dist import config as configs
 from space_dist.arithmetic import SETTINGS
 from space_dist.errors import SpaceDistError
@@ -118,7 +119,7 @@ def throughput(
         typer.Option(help="Keep here which settings were fastest; what is kept there is not searched again."),
     ] = None,
     out: Annotated[Optional[Path], typer.Option(help="Folder for the table and the figure.")] = None,  # noqa: UP045
-    json_file: Annotated[Optional[Path], typer.Option("--json", help="Also write the numbers here.")] = None,  # noqa: UP045
+    json_file: JsonFile = None,
 ) -> None:
     """Environment steps per second of PPO: ours (stock, lean, population) beside JAX, SBX, SB3 and RLlib."""
     unknown = sorted({*(only or ())} - {*PARTS})
@@ -158,8 +159,7 @@ def throughput(
         (out / "throughput.md").write_text(text)
         if table:
             _figure(table, out / "throughput.png")
-    if json_file is not None:
-        json_file.write_text(json.dumps(_numbers(table, ratios, projected), indent=1) + "\n")
+    keep(_numbers(table, ratios, projected), json_file)
     short = [name for name, ratio in ratios.items() if ratio < WANTED[name]]
     if short:
         console.print(f"Less than wanted: {', '.join(short)}.", style="red")

@@ -11,12 +11,12 @@ from space_dist.experiment import manifest as manifests
 from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
-from space_dist.grid.warm import LocalExecutor, local_is_enough
+from space_dist.grid.warm import LocalExecutor, needs_ray
 from space_dist.system.extras import needed_from
 from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import code_digest
-from space_dist.system.workplace import lasting, private_ray, workplace
+from space_dist.system.workplace import cores, lasting, private_ray, workplace
 
 if TYPE_CHECKING:
     from space_dist.api.reports import ReportView
@@ -118,13 +118,18 @@ def worked_through(
     observe: Callable[[Overview], None], address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
     nodes: int = 1, reinstall: Callable[[], None] = lambda: None,
 ) -> list[RunStatus]:  # fmt: skip
-    """Work through runs of a frozen grid; returns where they stand in the end. Arguments: as of `grid.jobs.conduct`."""
-    if address == "local" and local_is_enough(manifest, runs, max_parallel):
-        with LocalExecutor(place, manifest, stop.reason) as here:
+    """Work through runs of a frozen grid; returns where they stand in the end. Arguments: as of `grid.jobs.conduct`.
+
+    mode: `auto` on this machine (address local) is no Ray, unless runs have rollout actors.
+    """
+    if address == "local" and mode == "auto" and not needs_ray(manifest):
+        size = max(1, min(max_parallel or cores(), len(runs)))
+        with LocalExecutor(place, manifest, size, stop.reason) as here:
             return Conductor(place, manifest, runs, here, stop_requested=stop.reason, observe=observe).conduct()
     if address == "local":
         private_ray()
-    with needed_from("ray", "a grid whose runs go side by side", "do them one after another: --max-parallel 1"):
+    what, instead = "a grid on a cluster, or whose runs have rollout actors,", "set resources.workers: 0"
+    with needed_from("ray", what, instead):
         from space_dist.grid.jobs import conduct
 
     return conduct(

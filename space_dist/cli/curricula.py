@@ -7,8 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from space_dist.cli.terminal import Kwargs, parse_kwargs, say
-from space_dist.errors import ConfigError
+from space_dist.cli.terminal import Kwargs, parse_kwargs, say, tell_findings
 
 curriculum_app = typer.Typer(no_args_is_help=True, help="Check curricula of your own.")
 
@@ -31,8 +30,5 @@ def curriculum_check(
 
     chosen, bounds = read_features(instances, column or ())
     findings = check(curriculum, chosen, bounds, parse_kwargs(kwarg))
-    for note in findings.notes:
-        say(f"note: {note}")
-    if findings.faults:
-        raise ConfigError("\n".join(one if curriculum in one else f"{curriculum}: {one}" for one in findings.faults))
+    tell_findings(findings, curriculum)
     say(f"{curriculum}: no fault found in {DECISIONS} decisions on {len(chosen)} instances")

@@ -90,10 +90,14 @@ def grid_run(
         typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
     ] = None,
     address: Annotated[
-        str, typer.Option(help="local: a private Ray on this machine; auto: the Ray cluster this process is in.")
+        str, typer.Option(help="local: this machine; auto: the Ray cluster this process is in.")
     ] = "local",
     mode: Annotated[
-        str, typer.Option(help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length.")
+        str,
+        typer.Option(
+            help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length. On this "
+            "machine Ray is used with `pool`, and by `auto` where runs have rollout actors."
+        ),
     ] = "auto",
     part: Annotated[
         Optional[str],  # noqa: UP045

@@ -108,13 +108,11 @@ def cores_and_memory() -> Iterator[Finding]:
         if text.isdecimal():
             free = min(free, int(text))
     megabytes = free >> 20
-    if megabytes >= _LEAST_MB:
-        yield Finding("ok", f"{megabytes:,} MB of memory are free")
-    else:
-        yield Finding(
-            "note", f"{megabytes:,} MB of memory are free; a run with Ray takes about {_LEAST_MB:,}",
-            "use --workers 0, which needs no Ray",
-        )  # fmt: skip
+    what = f"{megabytes:,} MB of memory are free"
+    yield _noted_unless(
+        megabytes >= _LEAST_MB, what, f"{what}; a run with Ray takes about {_LEAST_MB:,}",
+        "use --workers 0, which needs no Ray",
+    )  # fmt: skip
 
 
 def disk() -> Iterator[Finding]:
@@ -128,10 +126,8 @@ def disk() -> Iterator[Finding]:
         yield Finding("note", f"{place} cannot be written to: runs would go there", "use another folder, or --out DIR")
         return
     free = shutil.disk_usage(place).free >> 20
-    if free < _LEAST_FREE_MB:
-        yield Finding("note", f"{free:,} MB are free in {place}, where runs go", "make room, or use --out DIR")
-    else:
-        yield Finding("ok", f"{free:,} MB are free in {place}, where runs go")
+    what = f"{free:,} MB are free in {place}, where runs go"
+    yield _noted_unless(free >= _LEAST_FREE_MB, what, what, "make room, or use --out DIR")
 
 
 def arithmetic_here() -> Iterator[Finding]:
@@ -225,14 +221,17 @@ def slurm_here() -> Iterator[Finding]:
             fine = done.returncode == 0
         except (OSError, subprocess.TimeoutExpired) as error:
             said, fine = str(error), False
-        if fine:
-            yield Finding("ok", f"SLURM: {said}")
-        else:
-            yield Finding(
-                "note", f"SLURM: {Path(words[0]).name} fails: {said}",
-                "nothing, unless this machine should submit jobs: then ask who runs the cluster",
-            )  # fmt: skip
+        yield _noted_unless(
+            fine, f"SLURM: {said}", f"SLURM: {Path(words[0]).name} fails: {said}",
+            "nothing, unless this machine should submit jobs: then ask who runs the cluster",
+        )  # fmt: skip
+        if not fine:
             return
+
+
+def _noted_unless(fine: bool, what: str, otherwise: str, mend: str) -> Finding:
+    """`what` is ok; where it is not `fine`, a note says what is `otherwise` and how to mend it."""
+    return Finding("ok", what) if fine else Finding("note", otherwise, mend)
 
 
 def _version(distribution: str) -> str | None:

@@ -103,6 +103,7 @@ import typer
 from rich.console import Console
 
 from space_dist.errors import ConfigError, SpaceDistError, nearest
+from space_dist.system.findings import Findings
 
 console = Console()
 errors = Console(stderr=True)
@@ -130,6 +131,14 @@ def say(text: str) -> None:
 def warn(text: str) -> None:
     """The same, on standard error."""
     errors.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def tell_findings(findings: Findings, checked: str) -> None:
+    """Say what a check of `checked` noted. Raises ConfigError with its faults, a line each, if it found any."""
+    for note in findings.notes:
+        say(f"note: {note}")
+    if findings.faults:
+        raise ConfigError("\n".join(one if checked in one else f"{checked}: {one}" for one in findings.faults))
 
 
 def write(path: Path, text: str) -> None:

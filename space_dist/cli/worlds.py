@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from space_dist.cli.terminal import Kwargs, parse_kwargs, say
+from space_dist.cli.terminal import Kwargs, parse_kwargs, say, tell_findings
 from space_dist.errors import ConfigError
 
 env_app = typer.Typer(no_args_is_help=True, help="Check environments.")
@@ -32,10 +32,7 @@ def env_check(
     if instances is not None:
         chosen = read_csv(instances, read_spec(env, context_visible=False, kwargs=kwargs).context_bounds)
     findings = check(env, kwargs, chosen)
-    for note in findings.notes:
-        say(f"note: {note}")
-    if findings.faults:
-        raise ConfigError("\n".join(fault if env in fault else f"{env}: {fault}" for fault in findings.faults))
+    tell_findings(findings, env)
     say(f"{env}: no fault found. Context: {', '.join(findings.names)}. Horizon: {findings.horizon} steps")
 
 

@@ -72,9 +72,11 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     fault: one of `ValidationError.errors()`. source: the file. origins: which keys came from elsewhere.
     """
     path, model = _locate(fault["loc"], root)
+    # Pydantic places a tag's fault at the section; the key that people wrote is its `kind`.
     if fault["type"].startswith("union_tag"):
         path.append("kind")
     key = ".".join(path)
+    # An override's key may be a section above the fault, or one below it.
     related = (
         origin for name, origin in origins.items() if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
     )
@@ -97,6 +99,7 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         message = str(context.get("error", fault["msg"]))
         if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
             return f"{where}: {key}: {message}" if key else f"{where}: {message}"
+        # A value is not repeated here: a URI may hold a password.
         if isinstance(context.get("error"), UriError):
             return f"{where}: {key}: {message}"
         return f"{where}: {key}: {message}, not {short(given)}"

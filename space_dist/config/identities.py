@@ -32,6 +32,7 @@ def identity(
         data["sources"] = dict(sources)
     if with_seed:
         data["seed"] = config.seed
+    # sort_keys: the order in which a file has its keys decides nothing.
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 

@@ -27,6 +27,7 @@ _MAX_NESTING = 50  # the parser is recursive, and so is the check against the sc
 
 def to_yaml(data: Mapping[str, Any]) -> str:
     """Plain data as YAML text."""
+    # pure: ruamel's C parser reads YAML 1.1, where `yes` is true, and need not be installed.
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
@@ -43,6 +44,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path} is not a regular file")
         with path.open("rb") as file:
+            # One byte more than is allowed tells a file that is too large, without reading it all.
             content = file.read(_MAX_CONFIG_BYTES + 1)
     except FileNotFoundError:
         folder = path.parent
@@ -149,6 +151,7 @@ def _refuse_tricks(text: str, source: str) -> None:
 
 def _plain(value: Any, path: tuple[str, ...] = ()) -> Any:
     """Only what JSON knows, so that dates, sets and self-containing aliases cannot surprise anyone later."""
+    # An alias may hold itself: there is no end to what is copied then.
     if len(path) > _MAX_NESTING:
         raise RecursionError
 

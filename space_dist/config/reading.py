@@ -102,6 +102,7 @@ def apply_override(data: dict[str, Any], override: str) -> None:
     if not equals or not all(parts) or not override.isprintable():
         raise ConfigError(f"{told(repr(override))}: write KEY=VALUE, like --set budget.steps=20000")
     value = parse_yaml(text, told(override))
+    # Who types a path at a prompt means it from where they stand, and not from the config's folder.
     if parts[0] in ("instances", "init_from"):
         value = _from_here(value)
     put(data, ".".join(parts), value, told(override))

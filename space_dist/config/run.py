@@ -132,6 +132,7 @@ class RunConfig(Section):
                     f"not {self.rollout.shards} and {self.rollout.slots}"
                 )
             return self
+        # A slot's share of a round must be whole: `n_steps` is the same constant for every curriculum (decision 8).
         if self.learner.n_steps % per_step:
             raise ValueError(
                 f"learner.n_steps = {self.learner.n_steps} is not a multiple of rollout.shards * rollout.slots = "

@@ -21,6 +21,7 @@ class Section(BaseModel):
     """A part of a config: nothing unknown, nothing converted, nothing changed later."""
 
     model_config = ConfigDict(
+        # strict: "1" is no number here, and 1 no truth value.
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True,
         serialize_by_alias=True,
     )  # fmt: skip
@@ -61,6 +62,7 @@ class EnvConfig(Section):
 class InstancesConfig(Section):
     """The instance sets."""
 
+    # strict=False: YAML has no paths, only words.
     train: Path = Field(strict=False)
     """CSV of the training instances (columns: id and the context's features, in environment units); a relative path is
     relative to this config file."""
@@ -98,6 +100,7 @@ class RolloutConfig(Section):
     def _left_out(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             return data
+        # Dropped, so that `model_fields_set` tells what a user chose; see `fitted`.
         return {key: value for key, value in data.items() if key not in ("shards", "slots") or value != "auto"}
 
     def fitted(self, n_steps: int | None) -> Self:

@@ -62,9 +62,11 @@ def checked_uri(uri: str) -> str:
 
     Raises UriError for a store that is not mirrored to, with a sentence that repeats no password.
     """
+    # What may hold a password is not repeated.
     shown = "" if "@" in uri else f" {uri!r}"
     try:
         parts = urlsplit(uri)
+        # `port` raises ValueError for what is no number.
         host, port, has_credentials = parts.hostname, parts.port, "@" in parts.netloc
     except ValueError:
         raise UriError(f"the tracking URI{shown} is not a URI; {ALLOWED}") from None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from space_dist.curricula.draws import Draws, distinct
+from space_dist.curricula.draws import Draws, distinct, mean_values, needed_episodes
 from space_dist.curricula.interface import (
     GENERATED,
     BoolArray,
@@ -77,9 +77,7 @@ class AlpGmm(Curriculum):
 
     def step(self, state: MixtureState, feedback: Feedback) -> tuple[MixtureState, Selection, Numbers]:
         """Take in the finished episodes one by one; fit where `fit_rate` of them are complete."""
-        episodes = feedback.episodes
-        if episodes is None:
-            raise ValueError("ALP-GMM needs the iteration's episodes")
+        episodes = needed_episodes(feedback, "ALP-GMM")
         contexts, returns = state.contexts, state.returns
         recent, means, covariances = state.recent, state.means, state.covariances
         count = state.episodes
@@ -99,8 +97,7 @@ class AlpGmm(Curriculum):
         new = MixtureState(state.version + 1, contexts, returns, recent, count, means, covariances)
         numbers: Numbers = {
             "size": distinct(feedback) if self._from_set else len(episodes.indices),
-            "mean_value_before": float(np.abs(feedback.values_before).mean()),
-            "mean_value_after": float(np.abs(feedback.values_after).mean()),
+            **mean_values(feedback),
             "finished_episodes": count,
             "fitted": fit_rows is not None,
             "components": len(means),
@@ -114,6 +111,7 @@ class AlpGmm(Curriculum):
         count, n, d = self._draws.count, len(self._instances), len(self._bounds.names)
         uniform = random.random((count, d))
         instances = random.integers(n, size=count)
+        # All of it is drawn whether or not a mixture is there: what is uniform does not depend on that.
         at_random: BoolArray = random.random(count) < self._random_share
         if len(state.means):
             drawn = self._from_mixture(state, random)
@@ -134,6 +132,7 @@ class AlpGmm(Curriculum):
         normal = random.standard_normal((self._draws.count, state.means.shape[1]))
         roots = np.linalg.cholesky(state.covariances)
         samples = state.means[chosen] + np.einsum("nij,nj->ni", roots[chosen], normal)
+        # Without the last feature, which is the learning progress.
         clipped: FloatArray = np.clip(samples[:, :-1], 0.0, 1.0)
         return clipped
 
@@ -170,6 +169,7 @@ def fit_mixture(rows: FloatArray, most: int, seed: int) -> tuple[FloatArray, Flo
     from sklearn.mixture import GaussianMixture  # a second to import, and only this curriculum needs it
     from threadpoolctl import threadpool_limits
 
+    # One thread: the bits of a product depend on how many share it.
     with warnings.catch_warnings(), threadpool_limits(limits=1):
         warnings.simplefilter("ignore")  # rows may repeat, and not every mixture need converge to be compared
         counts = range(FEWEST_COMPONENTS, min(most, len(rows)) + 1)

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -37,6 +37,7 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.seeding import Purpose, generator
+from space_dist.system.findings import FaultError, Findings
 
 DECISIONS: Final = 30
 _DRAWS: Final = Draws(count=64, walks=4)
@@ -44,18 +45,6 @@ _LONGEST: Final = 20  # steps of an episode
 _MOST_EPISODES: Final = 24  # that end in an iteration
 _SEED: Final = 0
 _START, _STEP, _SELECTION, _PROBES = "start()", "step()", "selection()", "probes()"
-
-
-@dataclass
-class Findings:
-    """faults: what must be repaired, a sentence each.  notes: what is allowed but may not be meant."""
-
-    faults: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
-class _FaultError(Exception):
-    """A fault that ends the check: what comes behind could not be told apart from it."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +69,7 @@ def check(
     findings = Findings()
     try:
         _Check(import_path, instances, bounds, kwargs, findings).run()
-    except _FaultError as fault:
+    except FaultError as fault:
         findings.faults.append(str(fault))
     return findings
 
@@ -109,7 +98,7 @@ class _Check:
         if (difference := _difference(again, other)) is not None or (
             difference := _difference(first, other)
         ) is not None:
-            raise _FaultError(
+            raise FaultError(
                 f"start() is not a function of instances and seed: asked again, it gives another {_named(difference)}. "
                 f"{_WHERE_FROM}"
             )
@@ -126,7 +115,7 @@ class _Check:
             answer = self._check_decision(used, (state, restored), feedback, decision, iteration.flavour)
             same = _difference(answer[1].ids, selection.ids) is None
             if answer[1].order_version == selection.order_version and not same:
-                raise _FaultError(
+                raise FaultError(
                     "step() selects other instances under the same order_version, and the walk over the old ones would "
                     "go on; set order_version to the version at which ids last changed"
                 )
@@ -141,11 +130,12 @@ class _Check:
         """states: the one that the object returned, and the same as a checkpoint gives it back."""
         state, restored = states
         what = f"step(){flavour}"
+        # Copies are handed over, so that a change in place is seen beside what was meant.
         given = copy.deepcopy((state, feedback))
         answer: tuple[State, Selection, Any] = _called(what, lambda: used.step(*given))
         for name, before, after in zip(("state", "feedback"), (state, feedback), given, strict=True):
             if (difference := _difference(before, after, name)) is not None:
-                raise _FaultError(
+                raise FaultError(
                     f"step() changes {difference}, which it was given, in place; whoever asks again would ask "
                     "something else. Copy it first"
                 )
@@ -153,21 +143,21 @@ class _Check:
         new = [_called(f"{what}, of an object that made no decision before,", functools.partial(self._step_anew, *one),
                        hint=". What it remembers must be in its state") for one in begun]  # fmt: skip
         if (difference := _difference(new[0], new[1])) is not None:
-            raise _FaultError(
+            raise FaultError(
                 f"two new objects, given the same state and feedback, give another {_named(difference)} each (decision "
                 f"{decision}): it is not a function of these. {_WHERE_FROM}"
             )
         again = _called(what, lambda: used.step(*copy.deepcopy((state, feedback))))
         for one in (again, answer):
             if (difference := _difference(one, new[0])) is not None:
-                raise _FaultError(
+                raise FaultError(
                     f"the object remembers something that is not in its state: it gives another {_named(difference)} "
                     f"than a new one that is given the same state and feedback (decision {decision}). Put all that "
                     "changes, that of random generators included, into the state; attributes must stay as __init__ "
                     "made them"
                 )
         if (difference := _difference(new[2], new[0])) is not None:
-            raise _FaultError(
+            raise FaultError(
                 "the state does not survive storing: as a checkpoint gives it back, it leads to another "
                 f"{_named(difference)} (decision {decision})"
             )
@@ -186,10 +176,10 @@ class _Check:
             lambda: decode_state(kind, stored.arrays, stored.data["curriculum"]),
         )
         if (difference := _difference(state, restored, kind.__name__)) is not None:
-            raise _FaultError(f"the state does not survive storing: {difference} comes back as another")
+            raise FaultError(f"the state does not survive storing: {difference} comes back as another")
         again = _called(_SELECTION, lambda: self._make().selection(restored))
         if (difference := _difference(selection, again, "selection")) is not None:
-            raise _FaultError(
+            raise FaultError(
                 f"selection() of a state gives another {difference} than start() or step() returned with it; a run "
                 "that goes on would train on something else"
             )
@@ -237,7 +227,7 @@ class _Check:
                 instances=self._instances, seed=_SEED, draws=_DRAWS, bounds=self._bounds,
             )  # fmt: skip
         except ConfigError as error:
-            raise _FaultError(str(error)) from None
+            raise FaultError(str(error)) from None
 
     def _iteration(self, decision: int, selection: Selection, before: FloatArray) -> _Iteration:
         """One iteration: seeded, and by turns without an episode that ended, and without a gradient step."""
@@ -272,7 +262,7 @@ class _Check:
         asked = [_called(_PROBES, functools.partial(one.probes, *copy.deepcopy((state, episodes))))
                  for one in (used, self._make())]  # fmt: skip
         if _difference(*asked) is not None:
-            raise _FaultError(
+            raise FaultError(
                 "probes() is not a function of state and episodes: asked again, it names other instances. "
                 f"{_WHERE_FROM}"
             )
@@ -319,9 +309,9 @@ def _named(part: str) -> str:
 def _called(what: str, call: Callable[[], Any], hint: str = "") -> Any:
     try:
         return call()
-    except _FaultError:
+    except FaultError:
         raise
     except ConfigError as error:  # an answer that breaks the protocol
-        raise _FaultError(str(error)) from None
+        raise FaultError(str(error)) from None
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
-        raise _FaultError(f"{what} fails: {type(error).__name__}: {str(error)[:300]}{hint}") from None
+        raise FaultError(f"{what} fails: {type(error).__name__}: {str(error)[:300]}{hint}") from None

@@ -177,6 +177,7 @@ class Makers:
 
     def _set_moments(self) -> Gaussian:
         contexts = self._train.contexts
+        # ddof=0: the set is the whole of what is aimed at, and no sample of it.
         covariance = np.atleast_2d(np.cov(contexts, rowvar=False, ddof=0)) if len(contexts) > 1 else None
         try:
             if covariance is None:

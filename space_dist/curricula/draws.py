@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from space_dist.curricula.interface import (
     Curriculum,
+    Episodes,
     Feedback,
     FloatArray,
     IntArray,
@@ -82,8 +83,7 @@ class Drawn(Curriculum):
         return {
             "size": distinct(feedback),
             "effective_size": effective_size(chances),
-            "mean_value_before": float(np.abs(feedback.values_before).mean()),
-            "mean_value_after": float(np.abs(feedback.values_after).mean()),
+            **mean_values(feedback),
         }
 
 
@@ -114,6 +114,21 @@ def effective_size(chances: FloatArray) -> float:
     """How many instances the chances spread over: the exponential of their entropy."""
     positive = chances[chances > 0.0]
     return float(np.exp(-(positive * np.log(positive)).sum()))
+
+
+def mean_values(feedback: Feedback) -> Numbers:
+    """Mean sizes of the start values of all instances, before and after the iteration's updates, in reward units."""
+    return {
+        "mean_value_before": float(np.abs(feedback.values_before).mean()),
+        "mean_value_after": float(np.abs(feedback.values_after).mean()),
+    }
+
+
+def needed_episodes(feedback: Feedback, curriculum: str) -> Episodes:
+    """The iteration's. Raises ValueError, which names the curriculum that needs them, if there are none."""
+    if feedback.episodes is None:
+        raise ValueError(f"{curriculum} needs the iteration's episodes")
+    return feedback.episodes
 
 
 def distinct(feedback: Feedback) -> int:

@@ -87,6 +87,7 @@ class Learnability(Drawn):
             sums = np.bincount(feedback.probes.indices, weights=feedback.probes.success, minlength=n)
             success = np.where(counts > 0, sums / np.maximum(counts, 1), success)
             probed, steps = probed | (counts > 0), int(feedback.probes.lengths.sum())
+            # Counted from the last probe that was made: where the budget had no room, it stays due.
             due = state.version + self._every
         scores = learnability(success)
         chances = learnable_chances(scores, self._ties, self._top, self._uniform_share)
@@ -115,6 +116,7 @@ def learnable_chances(scores: FloatArray, ties: UInt64Array, top: int, uniform_s
     Equal scores stand in the order of `ties`. A score of 0 is never among the top; where all are 0, chances are equal.
     """
     chosen = np.lexsort((ties, -scores))[:top]
+    # Always or never solved: there is nothing to learn, or no way to (docs/curricula.md).
     chosen = chosen[scores[chosen] > 0.0]
     chances = uniform(len(scores))
     if len(chosen):

@@ -77,6 +77,7 @@ class LevelReplay(Drawn):
         sums = np.bincount(episodes.indices, weights=episodes.advantages, minlength=n)
         scores = np.where(counts > 0, sums / np.maximum(counts, 1), state.scores)
         last = state.last.copy()
+        # `at`: an instance may have ended more than once, and the last time counts.
         np.maximum.at(last, episodes.indices, state.episodes + np.arange(m))
         count = state.episodes + m
         chances = (
@@ -162,11 +163,13 @@ def replayed(
             left = list(range(m - 1, -1, -1))
         if term < share:
             stale = np.cumsum(place - fresh_at[left[::-1]])
+            # Nothing is stale: all that is left counts alike, as in `replay_chances`.
             if not stale[-1]:
                 stale = np.arange(1, len(left) + 1)
             rank = int(np.searchsorted(stale, point * float(stale[-1]), side="right"))
         else:
             rank = bisect.bisect_right(below, point * below[len(left) - 1], 0, len(left))
+        # min: rounding may put a number at the very end of the sums.
         one = left.pop(len(left) - 1 - min(rank, len(left) - 1))
         drawn.append(one)
         fresh_at[one] = place + 1

@@ -27,6 +27,7 @@ class RoundRobin(Curriculum):
         self, instances: InstanceSet, *, seed: int, ids: Sequence[int] | None = None, count: int | None = None
     ) -> None:
         self._instances = instances
+        # Keys of ids and contexts: the order of rows in the file decides nothing.
         order = np.argsort(instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts), kind="stable")
         self._order = order[:count] if ids is None else order[np.isin(instances.ids[order], ids)]
 

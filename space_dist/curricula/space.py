@@ -61,6 +61,7 @@ class Space(Curriculum):
         self._rank, self._mean, self._growth = rank, mean, growth
         self._adaptive_eta, self._patience, self._epsilon = adaptive_eta, patience, epsilon
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
+        # Decision 2 of docs/algorithm.md.
         self._first = np.argsort(self._ties)[:1] if first is None else _highest(first, 1, self._ties)
 
     def start(self) -> tuple[SetState, Selection]:
@@ -101,11 +102,13 @@ class Space(Curriculum):
         new = dataclasses.replace(
             state,
             version=state.version + 1,
+            # Only another order sends the walk back to its beginning (docs/algorithm.md, "The walk").
             order_version=state.order_version if np.array_equal(selected, state.selected) else state.version + 1,
             size=size,
             selected=selected,
             tests=state.tests + tested,
             growths=state.growths + grew,
+            # A whole set cannot grow, and so does not stall.
             stalled=0 if grew or size == n else state.stalled + tested,
             mean_value=mean_after,
             eta=eta if self._adaptive_eta == "persistent" else None,

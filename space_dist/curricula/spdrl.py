@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import BFGS, Bounds, NonlinearConstraint, minimize
 from scipy.sparse.linalg import cg
 
-from space_dist.curricula.draws import Draws
+from space_dist.curricula.draws import Draws, mean_values, needed_episodes
 from space_dist.curricula.gaussian import Gaussian
 from space_dist.curricula.interface import (
     GENERATED,
@@ -108,9 +108,7 @@ class SelfPaced(Curriculum):
 
     def step(self, state: ContextState, feedback: Feedback) -> tuple[ContextState, Selection, Numbers]:
         """Move the distribution, once the warm-up is over."""
-        episodes = feedback.episodes
-        if episodes is None:
-            raise ValueError("SPDRL needs the iteration's episodes")
+        episodes = needed_episodes(feedback, "SPDRL")
         old, updates = state.distribution, state.updates
         performance = float(episodes.discounted_returns.mean()) if len(episodes.indices) else None
         to_target = old.kl_to(self._target)
@@ -126,8 +124,7 @@ class SelfPaced(Curriculum):
         new = ContextState(state.version + 1, moved.distribution.mean, moved.distribution.factor, updates)
         numbers: Numbers = {
             "size": len(episodes.indices),
-            "mean_value_before": float(np.abs(feedback.values_before).mean()),
-            "mean_value_after": float(np.abs(feedback.values_after).mean()),
+            **mean_values(feedback),
             "mean_discounted_return": performance,
             "alpha": alpha,
             "kl_to_target": moved.distribution.kl_to(self._target),
@@ -317,5 +314,6 @@ def _standardised(problem: Objective, least_std: FloatArray | None) -> tuple[Obj
     if least_std is None:
         return objective, start, None
     low = np.full(len(start), -np.inf)
+    # In these coordinates L is L_old^-1 L, whose diagonal is that of L over that of L_old.
     low[d : 2 * d] = np.log(least_std) - np.log(np.diag(old.factor))
     return objective, start, low

@@ -79,6 +79,7 @@ def near_member(scaled: FloatArray) -> Rank:
     def rank(feedback: Feedback, trained: Members) -> FloatArray:  # noqa: ARG001 - a Rank
         chosen, others = scaled[trained], np.flatnonzero(~trained)
         scores = np.ones(len(scaled))  # not 0, which is the score of a stranger with a member's context
+        # Table by table: all distances at once would be (n, size, d) numbers.
         rows = max(1, _CHUNK_NUMBERS // chosen.size)
         for start in range(0, len(others), rows):
             some = others[start : start + rows]
@@ -117,6 +118,7 @@ class Reading(NamedTuple):
 
     def eta_to_grow(self, epsilon: float) -> float:
         """Theorem 2's (dV + epsilon) / V_{t-1}, finite for any values."""
+        # epsilon also below, where the paper has V_{t-1} alone: near 0 that makes eta as large as it pleases.
         return min(sys.float_info.max, (self.change + epsilon) / max(self.reference, epsilon))
 
 
@@ -140,4 +142,5 @@ def readings(before: FloatArray, after: FloatArray, stored: float | None) -> dic
 
 def grown(growth: Growth, size: int, kappa: int) -> int:
     """The next size of a set that grows."""
+    # `multiply` is the released code's `--multi`, and the paper's sets that grow fast.
     return size * kappa if growth == "multiply" else size + kappa

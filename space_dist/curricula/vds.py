@@ -27,6 +27,7 @@ class ValueDisagreement(Drawn):
         if feedback.ensemble is None:
             raise ValueError("VDS needs the values of an ensemble")
         found = disagreement(feedback.ensemble)
+        # Below the floor members differ by rounding alone.
         new = DrawnState(state.version + 1, proportional(found, floor=FLOOR))
         numbers = self._numbers(feedback, new.chances)
         numbers |= {"mean_disagreement": float(found.mean()), "largest_disagreement": float(found.max())}

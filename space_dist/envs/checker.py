@@ -12,7 +12,7 @@ import functools
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -28,6 +28,7 @@ from space_dist.envs.observations import Observations
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, episode_seeds, generator
+from space_dist.system.findings import FaultError, Findings
 
 COMPARED_STEPS: Final = 200  # of an episode; horizons are played to their end once
 N_CONTEXTS: Final = 8
@@ -36,17 +37,11 @@ _ROUNDED: Final = "precision lowered by casting to float32"  # in a warning of G
 
 
 @dataclass
-class Findings:
-    """faults: what must be repaired, a sentence each.  notes: what is allowed but may not be meant."""
+class EnvironmentFindings(Findings):
+    """Also what the environment is. horizon: in steps.  names: of the context's features."""
 
     horizon: int = 0
     names: tuple[str, ...] = ()
-    faults: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
-class _FaultError(Exception):
-    """A fault that ends the check: what comes behind could not be told apart from it."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +58,7 @@ _Episode = tuple[_Moment, ...]
 
 def check(
     env_id: str, kwargs: Mapping[str, Any] = MappingProxyType({}), instances: InstanceSet | None = None
-) -> Findings:
+) -> EnvironmentFindings:
     """Look for every fault that a run would suffer from.
 
     Contexts are drawn uniformly within their bounds (by the environment, if it draws its own), the corners of the
@@ -71,12 +66,12 @@ def check(
     """
     if instances is not None and len(instances) < 2:
         raise ConfigError("it takes at least two instances to see whether contexts matter")
-    findings = Findings()
+    findings = EnvironmentFindings()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
             _Check(env_id, kwargs, instances, findings).run()
-        except _FaultError as fault:
+        except FaultError as fault:
             findings.faults.append(str(fault))
     # Every copy of the environment warns again, and the check makes dozens.
     distinct = {(warning.category, str(warning.message)): warning for warning in told}
@@ -93,7 +88,7 @@ def check(
 
 class _Check:
     def __init__(
-        self, env_id: str, kwargs: Mapping[str, Any], instances: InstanceSet | None, findings: Findings
+        self, env_id: str, kwargs: Mapping[str, Any], instances: InstanceSet | None, findings: EnvironmentFindings
     ) -> None:
         self._env_id, self._kwargs, self._findings = env_id, kwargs, findings
         with self._opened(1) as env:
@@ -128,23 +123,23 @@ class _Check:
         if not {"seed", "options"} <= set(parameters) and not any(
             one.kind is one.VAR_KEYWORD for one in parameters.values()
         ):
-            raise _FaultError(
+            raise FaultError(
                 "reset() ignores seeds or contexts: it takes no `seed` or no `options`; Gymnasium's is "
                 "reset(self, *, seed=None, options=None)"
             )
         given = self._contexts[0].astype(env.get_wrapper_attr("context_space").dtype)
         told = _called("reset()", lambda: env.reset(seed=int(self._seeds[0]), options={"context": given}))
         if not isinstance(told, tuple) or len(told) != 2:
-            raise _FaultError("reset() must return (observation, info)")
+            raise FaultError("reset() must return (observation, info)")
         self._refuse_misfits(env.observation_space, _as_batch(told[0]), 1, "reset")
         for time in range(min(COMPARED_STEPS, self._horizon)):
             action = _scalar(self._actions[0, time])
             before = np.array(action)
             told = _called("step()", functools.partial(env.step, action))
             if not np.array_equal(before, action):
-                raise _FaultError("step() changes the action it is given, which is the learner's; copy it first")
+                raise FaultError("step() changes the action it is given, which is the learner's; copy it first")
             if not isinstance(told, tuple) or len(told) != 5:
-                raise _FaultError("step() must return (observation, reward, terminated, truncated, info)")
+                raise FaultError("step() must return (observation, reward, terminated, truncated, info)")
             self._refuse_misfits(env.observation_space, _as_batch(told[0]), 1, f"step {time + 1}")
             if told[2] or told[3]:
                 break
@@ -165,7 +160,7 @@ class _Check:
                     return
                 if len(ended := np.flatnonzero(step.terminated | step.truncated)):
                     self._reset(env, ended, self._contexts[ended], self._seeds[ended])
-        raise _FaultError(
+        raise FaultError(
             f"episodes do not end: after its horizon of {self._horizon} steps neither terminated nor truncated was set"
         )
 
@@ -174,12 +169,12 @@ class _Check:
         first, second = ([self._alone(k) for k in range(N_EPISODES)] for _ in range(2))
         for one, other in zip(first, second, strict=True):
             if one[0] != other[0]:
-                raise _FaultError(
+                raise FaultError(
                     "the start state is not seeded: with the same seed and context, two episodes start differently. "
                     "Draw it from the seed given to reset() (self.np_random after super().reset(seed=seed)) alone"
                 )
             if one != other:
-                raise _FaultError(
+                raise FaultError(
                     f"there is unseeded randomness in step(): with the same seed, context and actions, two episodes "
                     f"differ from step {_first_difference(one, other)} on. Draw it from the seed given to reset() alone"
                 )
@@ -194,12 +189,12 @@ class _Check:
                 if found == reference[k]:
                     continue
                 if found == self._alone(k, context=N_EPISODES):
-                    raise _FaultError(
+                    raise FaultError(
                         "a context does not arrive: only that of the very first reset counts, later ones are ignored"
                     )
                 where = _first_difference(found, reference[k])
                 what = "it starts differently" if where == 0 else f"it differs from step {where} on"
-                raise _FaultError(
+                raise FaultError(
                     "the trajectory depends on earlier episodes: played again after others, with the same seed, "
                     f"context and actions, {what}. reset() must put back everything that an episode changes"
                 )
@@ -210,7 +205,7 @@ class _Check:
             with self._opened(len(order)) as env:
                 for k, found in zip(order, self._play(env, order), strict=True):
                     if k < N_EPISODES and found != reference[k]:
-                        raise _FaultError(
+                        raise FaultError(
                             "the trajectory depends on the neighbours in the batch: beside other episodes, with the "
                             "same seed, context and actions, it is another one. Copies must share nothing that changes "
                             "(class attributes, module globals, global random generators)"
@@ -221,7 +216,7 @@ class _Check:
         base = self._alone(0)
         told = [self._alone(0, context=k) for k in range(1, N_CONTEXTS)]
         if all(one == base for one in told):
-            raise _FaultError(
+            raise FaultError(
                 "contexts are ignored: another context changes nothing, neither the start nor a later observation, "
                 "reward or end"
             )
@@ -244,7 +239,7 @@ class _Check:
                 check_env(env, skip_render_check=True, skip_close_check=True)  # type: ignore[arg-type]
             except Exception as error:  # it asserts, and runs somebody else's code
                 text = " ".join(str(error).split()) or type(error).__name__
-                raise _FaultError(f"Gymnasium's own checker refuses it: {text[:300]}") from None
+                raise FaultError(f"Gymnasium's own checker refuses it: {text[:300]}") from None
         for warning in told:
             text = " ".join(str(warning.message).replace("\x1b[33m", "").replace("\x1b[0m", "").split())
             if "WARN" in text and "different from the unwrapped version" not in text:
@@ -269,7 +264,7 @@ class _Check:
         given = told({"context": context})
         kept = _called("reset() without a context (it must keep the last one)", lambda: told(None))
         if kept != given:
-            raise _FaultError(
+            raise FaultError(
                 "the context does not survive: after a reset without options it is another one. Keep the last context "
                 "given until a new one comes"
             )
@@ -318,7 +313,7 @@ class _Check:
         try:
             env = make_batched(self._env_id, n_slots, context_visible=False, kwargs=self._kwargs)
         except ConfigError as error:
-            raise _FaultError(str(error)) from None
+            raise FaultError(str(error)) from None
         try:
             yield env
         finally:
@@ -337,14 +332,14 @@ class _Check:
         what = f"reset() with {self._named(contexts)}"
         observations: Observations = _called(what, lambda: env.reset(slots, given, seeds.copy()))
         if not np.array_equal(given, contexts):
-            raise _FaultError("reset() changes the contexts it is given; copy them first")
+            raise FaultError("reset() changes the contexts it is given; copy them first")
         return observations
 
     def _step(self, env: BatchedEnv, actions: NDArray[Any]) -> Step:
         given = actions.copy()
         step: Step = _called("step()", lambda: env.step(given))
         if not np.array_equal(given, actions):
-            raise _FaultError("step() changes the actions it is given, which are the learner's; copy them first")
+            raise FaultError("step() changes the actions it is given, which are the learner's; copy them first")
         return step
 
     def _named(self, contexts: FloatArray) -> str:
@@ -364,7 +359,7 @@ class _Check:
         parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
         found = observations if isinstance(observations, dict) else {"": observations}
         if set(parts) != set(found):
-            raise _FaultError(
+            raise FaultError(
                 f"the observation at {where} has the parts {', '.join(sorted(found)) or 'none'}, its space has "
                 f"{', '.join(sorted(parts)) or 'none'}"
             )
@@ -377,28 +372,28 @@ class _Check:
             if name == "success" and array is None:
                 continue
             if np.shape(array) != (n,):
-                raise _FaultError(f"{name} at step {time} have shape {np.shape(array)}, not one number for each slot")
+                raise FaultError(f"{name} at step {time} have shape {np.shape(array)}, not one number for each slot")
             if name != "rewards" and np.asarray(array).dtype != np.bool_:
-                raise _FaultError(f"{name} at step {time} is of dtype {np.asarray(array).dtype}, not bool")
+                raise FaultError(f"{name} at step {time} is of dtype {np.asarray(array).dtype}, not bool")
         if not np.isfinite(step.rewards).all():
             bad = step.rewards[~np.isfinite(step.rewards)][0]
-            raise _FaultError(f"a reward at step {time} is {bad}: rewards must be finite numbers")
+            raise FaultError(f"a reward at step {time} is {bad}: rewards must be finite numbers")
 
 
 def _refuse_array(array: Any, space: Any, n: int, what: str) -> None:
     if not isinstance(array, np.ndarray):
-        raise _FaultError(f"{what} is a {type(array).__name__}, not an array")
+        raise FaultError(f"{what} is a {type(array).__name__}, not an array")
     if array.shape != (n, *space.shape):
-        raise _FaultError(f"spaces are wrong: {what} has shape {array.shape[1:]}, its space says {space.shape}")
+        raise FaultError(f"spaces are wrong: {what} has shape {array.shape[1:]}, its space says {space.shape}")
     if array.dtype != space.dtype:
-        raise _FaultError(f"spaces are wrong: {what} is of dtype {array.dtype}, its space says {space.dtype}")
+        raise FaultError(f"spaces are wrong: {what} is of dtype {array.dtype}, its space says {space.dtype}")
     if np.isnan(array).any():
-        raise _FaultError(f"{what} holds NaN")
+        raise FaultError(f"{what} holds NaN")
     outside = (array < space.low) | (array > space.high)
     if outside.any():
         index = tuple(int(one) for one in np.argwhere(outside)[0])
         place = index[1:]
-        raise _FaultError(
+        raise FaultError(
             f"spaces are wrong: {what} holds {array[index]:g} at {list(place)}, outside its space's bounds "
             f"[{space.low[place]:g}, {space.high[place]:g}]"
         )
@@ -449,4 +444,4 @@ def _called(what: str, call: Callable[[], Any]) -> Any:
         return call()
     except Exception as error:  # somebody else's code may raise anything
         text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {error}"
-        raise _FaultError(f"{what} fails: {text[:300]}") from None
+        raise FaultError(f"{what} fails: {text[:300]}") from None

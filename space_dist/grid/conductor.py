@@ -67,6 +67,7 @@ def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Ma
         with contextlib.suppress(LedgerError):  # a damaged one is replaced
             before = grid.manifest()
     if before is not None:
+        # Another version of this package does not make it another grid: its finished runs stay and are shown as such.
         same = dataclasses.replace(manifest, code=before.code, git=before.git) == before
         if same:
             with contextlib.suppress(LedgerError):

@@ -67,6 +67,7 @@ def conduct(
     to stop.
     """
     with _joined(address, manifest, max_parallel, stop_requested) as dashboard:
+        # `ray.init` replaces the handler of SIGTERM.
         reinstall()
         _await_nodes(nodes, stop_requested)
         size = _room_for(manifest, max_parallel)
@@ -119,6 +120,7 @@ def _await_nodes(count: int, stop_requested: Callable[[], str | None]) -> None:
 def _room_for(manifest: Manifest, max_parallel: int | None) -> int:
     """Runs that fit at a time, by CPUs that are free now. Raises SpaceDistError if the cluster is too small for one."""
     total: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+    # Free now, not all there are: others may be at work on the same cluster.
     free: dict[str, float] = ray.available_resources()  # type: ignore[no-untyped-call]
     if total.get("CPU", 0.0) < manifest.cpus_per_run:
         raise SpaceDistError(
@@ -184,6 +186,7 @@ class Jobs:
     def adopt(self, runs: Sequence[Run]) -> list[Run]:
         """See `grid.Executor`."""
         known = {run.key: run for run in runs}
+        # Ray jobs outlive the conductor that submitted them.
         for job in self._client.list_jobs():
             metadata = job.metadata or {}
             if metadata.get("folder") != str(self._grid.folder) or job.status not in _LIVE:
@@ -215,6 +218,7 @@ class Jobs:
                 "--nonce", self._nonce.text, "--job", job,
             ]  # fmt: skip
             grace = self._manifest.resources.grace_seconds
+            # Ray sends SIGKILL 3 s after SIGTERM unless told otherwise: too soon for a checkpoint.
             environment = {"RAY_JOB_STOP_WAIT_TIME_S": str(int(grace) + 30), "PYTHONUNBUFFERED": "1"}
             taken = _submit(
                 self._client, entrypoint=shlex.join(command), submission_id=job, entrypoint_num_cpus=1,
@@ -226,6 +230,7 @@ class Jobs:
                     "code": self._manifest.code, **self._manifest.git,
                 },
             )  # fmt: skip
+            # Not taken and alive: an earlier conductor, killed since, had submitted this very attempt.
             if not taken and ((details := self._details(job)) is None or details.status not in _LIVE):
                 attempt += 1  # an id can be used once, even if its job never began
                 continue
@@ -284,6 +289,7 @@ def _submit(client: JobSubmissionClient, **job: Any) -> bool:
         try:
             client.submit_job(**job)
         except (RuntimeError, requests.RequestException) as error:
+            # The job server answers with text alone; these are Ray 2.60's words.
             if "already exists" in str(error):
                 return False
             if "No available agent" not in str(error) or time.monotonic() > deadline:
@@ -328,7 +334,9 @@ class Remote:
             command += ["--max-parallel", str(max_in_flight)]
         folder = hashlib.sha256(str(self._folder).encode()).hexdigest()[:8]  # grids of one name in several roots
         job = f"{_job_name(self._manifest)}-{folder}-conductor-{len(before) + 1}"
+        # A conductor ends after its runs have made their checkpoints; Ray's own 3 s would cut that short.
         environment = {"RAY_JOB_STOP_WAIT_TIME_S": "120", "PYTHONUNBUFFERED": "1"}
+        # A folder of its own: Ray would upload all of the current one, and refuses what is above 100 MiB.
         with tempfile.TemporaryDirectory() as upload:
             shutil.copy(grid.manifest_file, upload)
             shutil.copytree(grid.instances, Path(upload) / "instances")
@@ -357,6 +365,7 @@ class Remote:
                     say(line)
                 shown = len(lines)
                 if details.status not in _LIVE:
+                    # Not known of a job that was stopped.
                     code = details.driver_exit_code
                     return int(code) if code is not None else (0 if details.status == JobStatus.SUCCEEDED else 1)
             if stop_requested():

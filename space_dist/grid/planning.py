@@ -100,6 +100,7 @@ def _cell(
     """A cell, and the environment steps of each of its runs."""
     for key in ("tracking", "resources", "seed"):  # the grid's own
         data.pop(key, None)
+    # The name of a run may become a file's.
     name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
     config = configs.parse({**data, "name": name}, where)
     with about(where):
@@ -112,6 +113,7 @@ def _cell(
                 "no rollout actors of their own; use workers: 0, or engine: single"
             )
         train, test = files.sets(blueprint)
+        # For its errors: a grid of which one cell cannot work is not frozen.
         blueprint.setup(train, test)
         sources = {path: source_digest(path) for path in config.import_paths}
     weights = None if config.init_from is None else weights_in(config.init_from)
@@ -144,5 +146,6 @@ def _baseline(path: Path, config: GridConfig, cells: Sequence[Cell]) -> str:
         if len(found) != 1:
             raise ConfigError(f"{path}: baseline: {len(found)} cells have these settings; it must be exactly one")
         return found[0].id
+    # The paper's baseline, where the grid names none.
     round_robin = [cell for cell in cells if cell.config["curriculum"]["kind"] == "round_robin"]
     return (round_robin or list(cells))[0].id

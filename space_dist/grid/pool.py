@@ -107,6 +107,7 @@ class Pool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # Where Ray is gone, `ray.kill` would abort this process before it has said why.
         for slot in self._slots if ray_answers(self._address) else ():
             with contextlib.suppress(RayError):
                 ray.kill(slot.actor)
@@ -180,6 +181,7 @@ class Pool:
         elif slot.sign is None and now - slot.heard > _SIGN_SECONDS:
             slot.sign = slot.actor.sign.remote()
         if slot.node is not None and now - slot.heard > _SIGN_SECONDS + _LATE_SECONDS:
+            # Else it would be killed again at every look until Ray tells its death.
             slot.heard = now
             ray.kill(slot.actor)
 
@@ -190,6 +192,7 @@ class Pool:
 
     def _hire(self) -> _Slot:
         # Never restarted by Ray: who hires knows what it was doing.
+        # Concurrent calls, because `stop` and `sign` must be heard while `attempt` waits for a run.
         workers = ray.remote(num_cpus=1, max_restarts=0)(PoolWorker).options(max_concurrency=4)
         actor = workers.remote(str(self._grid.folder), self._nonce.text)
         return _Slot(actor, hired=time.monotonic(), sign=actor.sign.remote())  # type: ignore[attr-defined]
@@ -205,6 +208,7 @@ class Nonce:
     def place(self) -> None:
         """Raises LedgerError if the folder cannot be written."""
         try:
+            # The owner, by which others tell a nonce that a kill has left behind.
             self._path.write_text(json.dumps(this_process()))
         except OSError as error:
             raise LedgerError(f"cannot write the grid's folder {self._path.parent}: {error.strerror}") from None

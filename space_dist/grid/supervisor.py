@@ -131,6 +131,7 @@ class Supervisor:
         has_actors = manifest.resources.workers > 0
         seen = dataclasses.replace(
             watch.seen, runs=len(runs), code=code, oom_killed=_system_kills() > out_of_memory_before,
+            # Ray's library aborts (SIGABRT) a process whose cluster is gone.
             has_actors=has_actors, ray_answers=not (has_actors and code == -signal.SIGABRT) or ray_answers(address),
             stop_file=grid.stop_file.exists(), output=tuple(last_lines(output)),
         )  # fmt: skip
@@ -161,6 +162,7 @@ class _Child:
 
     def __init__(self, pid: int, pipe: int) -> None:
         self.pid, self._pipe = pid, pipe
+        # A child that hangs must not hang its supervisor.
         os.set_blocking(pipe, False)
         self.said: dict[str, Said] = {}
         self._process = psutil.Process(pid)
@@ -169,6 +171,7 @@ class _Child:
 
     @classmethod
     def fork(cls, work: Callable[[Tell], None], output: Path) -> _Child:
+        # Else what is buffered would be written twice, by both processes.
         sys.stdout.flush()
         sys.stderr.flush()
         parent = os.getpid()
@@ -180,8 +183,10 @@ class _Child:
         code = 1
         try:
             os.close(reading)
+            # A session of its own: what the run leaves behind is killed as one group.
             os.setsid()
             ctypes.CDLL(None).prctl(_PDEATHSIG, signal.SIGTERM)
+            # The parent died before PDEATHSIG was set, which is sent for later deaths only (prctl(2)).
             if os.getppid() != parent:
                 os._exit(Interrupted.exit_code)
             code = _child_main(work, output, writing)
@@ -191,6 +196,7 @@ class _Child:
             with contextlib.suppress(Exception):
                 sys.stdout.flush()
                 sys.stderr.flush()
+            # Past the parent's `finally` blocks and exit handlers, which are not ours to run.
             os._exit(code)
 
     def code(self) -> int | None:
@@ -231,6 +237,7 @@ class _Child:
                 self._words += chunk
         *lines, self._words = self._words.split(b"\n")
         for line in lines:
+            # A killed process may leave half a line.
             with contextlib.suppress(ValueError, KeyError, TypeError):
                 found = json.loads(line)
                 self.said[found["run"]] = Said(int(found["code"]), str(found["error"]), str(found["message"]))
@@ -278,11 +285,13 @@ class _Watch:
         for process in self.child.tree():
             with contextlib.suppress(psutil.Error):
                 used += process.memory_info().rss
+                # The first of the tree is the run's own process.
                 state = state or process.status()
         return used, state
 
     def _ask(self, seen: Evidence) -> None:
         self.seen = seen
+        # The run itself ends after `grace_seconds` on its last checkpoint: who is killed later than that hangs.
         self.kill_at = time.monotonic() + self.resources.grace_seconds + KILL_SECONDS
         self.child.signal(signal.SIGTERM)
 

@@ -1,4 +1,4 @@
-"""A supervisor in a process of its own, which keeps its imports from attempt to attempt; and one that needs no Ray."""
+"""Supervisors in processes of their own, which keep their imports from attempt to attempt; here, they need no Ray."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import select
 import subprocess
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -74,6 +75,7 @@ class WarmSupervisor:
             if not select.select([process.stdout], [], [], seconds)[0]:
                 return None
             chunk = os.read(process.stdout.fileno(), _CHUNK)
+            # End of file: it is gone, and waiting reaps it.
             if not chunk:
                 process.wait()
                 self._process = None
@@ -95,12 +97,17 @@ class WarmSupervisor:
             if self._stopped_since is not None and time.monotonic() - self._stopped_since > STOPPED_SECONDS:
                 self._process.kill()
 
+    def release(self) -> None:
+        """Have it end, after a checkpoint of whatever it still works on."""
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+
     def close(self, seconds: float) -> None:
-        """Have it end, after a checkpoint of whatever it still works on; kill it if it takes longer than `seconds`."""
-        if self._process is None or self._process.stdin is None:
+        """Release it, and wait for its end; kill it if that takes longer than `seconds`."""
+        self.release()
+        if self._process is None:
             return
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -144,18 +151,24 @@ def supervisor_lost(reason: str | None) -> Evidence:
     return Evidence(gone="supervisor", all_asked=reason or "")
 
 
+@dataclass
+class _Place:
+    """A supervisor on this machine, and what it is doing."""
+
+    supervisor: WarmSupervisor
+    attempts: Sequence[tuple[Run, int]] = ()
+    not_before: float = 0.0  # of the monotonic clock, for the next attempt
+    looked: float = 0.0
+
+
 class LocalExecutor:
-    """An `Executor` of one place on this machine, for runs without rollout actors: there is nothing for Ray to do."""
+    """An `Executor` of `size` places here, for runs without rollout actors: there is nothing for Ray to do."""
 
-    size = 1
-
-    def __init__(self, grid: Grid, manifest: Manifest, stop_requested: Callable[[], str | None]) -> None:
+    def __init__(self, grid: Grid, manifest: Manifest, size: int, stop_requested: Callable[[], str | None]) -> None:
+        self.size, self.memory_mb = size, memory_of_a_core() * min(1.0, cores() / size)
         self._grid, self._stop_requested = grid, stop_requested
-        self._supervisor = WarmSupervisor(grid.folder)
+        self._places = [_Place(WarmSupervisor(grid.folder)) for _ in range(size)]
         self._seconds = manifest.resources.grace_seconds + KILL_SECONDS
-        self._attempts: Sequence[tuple[Run, int]] = ()
-        self._not_before = self._looked = 0.0
-        self.memory_mb = memory_of_a_core()
 
     def __enter__(self) -> LocalExecutor:
         return self
@@ -163,22 +176,27 @@ class LocalExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._supervisor.close(2 * self._seconds)
+        for place in self._places:
+            place.supervisor.release()  # all at once, and then each is waited for
+        deadline = time.monotonic() + 2 * self._seconds
+        for place in self._places:
+            place.supervisor.close(max(0.0, deadline - time.monotonic()))
 
     def room(self) -> int:
         """See `grid.Executor`."""
-        return int(not self._attempts and time.monotonic() >= self._not_before)
+        return sum(map(self._is_free, self._places))
 
     def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
         """See `grid.Executor`."""
+        place = next(filter(self._is_free, self._places))
         each = tuple(AttemptId(run.cell.id, run.seed, attempt) for run, attempt in attempts)
         try:
-            self._supervisor.begin(Task(str(self._grid.folder), each))
+            place.supervisor.begin(Task(str(self._grid.folder), each))
         except OSError as error:
             raise SpaceDistError(
                 f"cannot start a process for the runs of {self._grid.folder}: {in_words(error)}"
             ) from None
-        self._attempts = attempts
+        place.attempts = attempts
 
     def adopt(self, runs: Sequence[Run]) -> list[Run]:  # noqa: ARG002 - a supervisor does not outlive its conductor
         """See `grid.Executor`."""
@@ -186,34 +204,41 @@ class LocalExecutor:
 
     def stop(self) -> None:
         """See `grid.Executor`."""
-        if self._attempts:
-            self._supervisor.stop()
+        for place in self._places:
+            if place.attempts:
+                place.supervisor.stop()
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
-        if not self._attempts:
-            return []
+        return [end for place in self._places if place.attempts for end in self._ended(place)]
+
+    def _ended(self, place: _Place) -> list[tuple[Run, Ended | None]]:
         try:
-            if (ends := self._supervisor.ended(0.0)) is None:
-                self._look()
+            if (ends := place.supervisor.ended(0.0)) is None:
+                self._look(place)
                 return []
-            found = understood(self._attempts, ends)
+            found = understood(place.attempts, ends)
         except SupervisorLostError:
-            log.warning("lost the supervisor")
-            found = all_lost(self._grid, self._attempts, supervisor_lost(self._stop_requested()))
-            self._not_before = time.monotonic() + _PAUSE_SECONDS
-        self._attempts = ()
+            log.warning("lost a supervisor")
+            found = all_lost(self._grid, place.attempts, supervisor_lost(self._stop_requested()))
+            place.not_before = time.monotonic() + _PAUSE_SECONDS
+        place.attempts = ()
         return found
 
-    def _look(self) -> None:
-        if time.monotonic() - self._looked > _LOOK_SECONDS:
-            self._looked = time.monotonic()
-            self._supervisor.kill_if_stopped()
+    @staticmethod
+    def _is_free(place: _Place) -> bool:
+        return not place.attempts and time.monotonic() >= place.not_before
+
+    @staticmethod
+    def _look(place: _Place) -> None:
+        if time.monotonic() - place.looked > _LOOK_SECONDS:
+            place.looked = time.monotonic()
+            place.supervisor.kill_if_stopped()
 
 
-def local_is_enough(manifest: Manifest, runs: Sequence[Run], max_parallel: int | None) -> bool:
-    """Whether all there is to do here is done one after another, by processes that need no Ray themselves."""
-    return not manifest.resources.workers and min(max_parallel or cores(), len(runs)) <= 1
+def needs_ray(manifest: Manifest) -> bool:
+    """Whether runs on this machine have anything for Ray to do: rollout actors."""
+    return manifest.resources.workers > 0
 
 
 def slurms_memory_of_a_core() -> list[float]:
@@ -222,6 +247,7 @@ def slurms_memory_of_a_core() -> list[float]:
     if (given := os.environ.get("SLURM_MEM_PER_CPU", "")).isdecimal():
         shares.append(float(given))
     if (given := os.environ.get("SLURM_MEM_PER_NODE", "")).isdecimal():
+        # SLURM sets one of the two, by how memory was asked for (--mem-per-cpu or --mem).
         shares.append(float(given) / cores())
     return shares
 

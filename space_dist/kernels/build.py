@@ -64,10 +64,12 @@ def _compile(functions: Sequence[Any], kinds: Sequence[Any], folder: Path | None
                 _keep(function, folder)
             function.compile(kind)
         if folder is not None:
+            # Last: who finds it loads without the lock.
             (folder / _READY).touch()
     except Exception:
         if folder is None:
             raise
+        # Whatever is half there would be found by the next process.
         shutil.rmtree(folder, ignore_errors=True)
         for function, kind in zip(functions, kinds, strict=True):
             function._cache.disable()
@@ -109,6 +111,7 @@ def _folder(kinds: str) -> Path | None:
             for one in way:  # one by one: a mode is that of the last folder alone, the others would have the umask's
                 one.mkdir(mode=0o700, exist_ok=True)
             if all(_own(one) for one in way):
+                # A folder that is there may lie on a full or read-only file system all the same.
                 tempfile.TemporaryFile(dir=folder).close()
                 return folder
     return None
@@ -151,4 +154,5 @@ def _alone(folder: Path, done: Callable[[], bool]) -> Iterator[None]:
                 break
         yield
     finally:
+        # Which lets go of the lock, also where the process is killed.
         os.close(lock)

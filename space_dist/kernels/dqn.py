@@ -64,6 +64,7 @@ def _loss(m: Any, plan: Any, layers: Any) -> Any:
             value = where_equal(taken, every(m, action), load(m, values_at + action * rows + row), value)
         error = value - load(m, plan.goals_at + row)
         size = where_greater(zero, error, zero - error, error)
+        # SB3's `smooth_l1_loss`, with its beta of 1.
         loss = fma(where_greater(one, size, half * size * size, size - half), share, loss)
         slope = where_greater(error, one, one, error)
         slope = where_greater(zero - one, slope, zero - one, slope) * share

@@ -119,6 +119,7 @@ def _tanh_by_exp(exponential: Any) -> Any:
     return made
 
 
+# log 2 in two parts: Cephes's in single precision, fdlibm's in double.
 _EXP = {
     types.float32: _exp(1.5 * 2.0**23, 0.693359375, -2.12194440e-4, -87.33654, 88.72283, 7),
     types.float64: _exp(1.5 * 2.0**52, 6.93147180369123816490e-1, 1.90821492927058770002e-10, -708.396, 709.7827, 13),

@@ -104,6 +104,7 @@ def _call(builder: ir.IRBuilder, name: str, *values: ir.Value) -> ir.Value:
 def _load(builder: ir.IRBuilder, pointer: ir.Value, lanes: Lanes) -> ir.Value:
     shape = ir.VectorType(pointer.type.pointee, lanes.count)
     found = builder.load(builder.bitcast(pointer, shape.as_pointer()))
+    # A number's alignment, not a vector's: LLVM would else move it with instructions that fault elsewhere.
     found.align = lanes.dtype.bitwidth // 8
     return found
 

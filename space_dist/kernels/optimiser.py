@@ -28,6 +28,7 @@ def norm(m: Any, first: int, last: int) -> Any:
 @compiled
 def clipping(largest: float, norm: float) -> float:
     """The factor that makes a gradient's norm the largest there may be, or 1."""
+    # 1e-6: as torch's `clip_grad_norm_`.
     factor = largest / (norm + 1e-6)
     return factor if factor < 1.0 else 1.0
 
@@ -69,6 +70,7 @@ def adam(m: Any, length: int, first: int, last: int, settings: Any, step: int, f
     for at in range(first, last, lanes):
         gradient = load(m, length + at) * clip
         mean, square = load(m, 2 * length + at), load(m, 3 * length + at)
+        # torch's own form (`lerp`), which rounds otherwise than b m + (1 - b) g.
         mean = fma(gradient - mean, mean_share, mean)
         square = fma(gradient * square_share, gradient, square * kept)
         mean, square = _if_any(mean), _if_any(square)

@@ -78,6 +78,7 @@ def _normalize(m: Any, plan: Any, count: int) -> None:
         away = where_greater(load(m, plan.shares_at + row), zero, load(m, at + row) - mean, zero)
         store(m, at + row, away)
         found = fma(away, away, found)
+    # SB3's 1e-8, and the n - 1 of torch's `std`.
     scale = every(m, root(np.float64(total(found)) / (count - 1)) + 1e-8)
     for row in range(0, rows, lanes):
         store(m, at + row, load(m, at + row) / scale)
@@ -118,6 +119,7 @@ def _categorical(m: Any, plan: Any, layers: Any, row: int) -> Any:
     """Log-probabilities of a few rows' actions, and entropies; all log-probabilities take the gradient's place."""
     rows = plan.rows
     logits_at, logs_at = layers[ACTOR, plan.depth][5] + row, layers[ACTOR, plan.depth][6] + row
+    # Taken off all logits, so that no exponential overflows.
     largest = load(m, logits_at)
     for output in range(1, plan.outputs):
         logit = load(m, logits_at + output * rows)
@@ -163,6 +165,7 @@ def _losses(m: Any, plan: Any, layers: Any, settings: Any, recorded: Any) -> Non
             log_probs, entropies = _categorical(m, plan, layers, row)
         else:
             log_probs, entropies = _gaussian(m, plan, layers, row)
+        # In rows too many 0: what stands there may have an infinite ratio, and 0 times that is NaN.
         log_ratios = where_greater(share, zero, log_probs - load(m, fields + row), zero)
         ratios = exp(log_ratios)
         gains = (zero - load(m, fields + rows + row)) * share
@@ -220,6 +223,7 @@ def update(
             forward(m, plan, layers, CRITIC)
             _losses(m, plan, layers, settings, recorded[done])
             done += 1
+            # 1.5: SB3's.
             if recorded[done - 1, DIVERGENCE] > 1.5 * settings.target_kl:
                 return done, steps, epoch + 1
             backward(m, plan, layers, ACTOR, count)

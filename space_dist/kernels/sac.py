@@ -139,6 +139,7 @@ def _improve(m: Any, plan: Any, layers: Any, alpha: Any, size: int) -> Any:
             pulled = fma(load(m, plan.pulled_at + at), slope, bonus)
             store(m, by_means_at + at, pulled)
             by_log_std = fma(pulled * exp(log_std), load(m, plan.noise_at + at), zero - weight)
+            # Beyond its ends a clamped log standard deviation has no gradient.
             store(m, by_scales_at + at, where_equal(log_std, given, by_log_std, zero))
     backward(m, plan, layers, ACTOR, size)
     return total(loss)
@@ -158,6 +159,7 @@ def update(
     share_out(m, plan, size)
     for step in range(len(recorded)):
         first, rows, number = step * size, plan.rows, settings.steps + step + 1
+        # As of before this step's own change of it, for critics and actor alike; SB3.
         alpha = every(m, settings.ent_coef)
         if settings.learned:
             alpha = exp(every(m, m[plan.log_alpha_at]))

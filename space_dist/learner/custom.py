@@ -64,6 +64,7 @@ def algorithm_class(config: LearnerConfig) -> type[BaseAlgorithm]:
                 f"{name} has a {method}() of its own, which would never be called: transitions are collected by "
                 "workers, and runs evaluated by them; what may differ is __init__, _setup_model and train",
             )
+    # As SB3's own loops call it: on-policy without arguments, off-policy with these two.
     given = {"batch_size": 1, "gradient_steps": 1} if config.keeps_next_observations else {}
     try:
         inspect.signature(found.train).bind(None, **given)  # type: ignore[attr-defined]
@@ -197,6 +198,7 @@ def _content(value: Any, depth: int = 0) -> Any:
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
+        # The bytes of an array of objects are addresses.
         return str(value.dtype), value.shape, value.tobytes() if value.dtype != object else repr(value.tolist())
     if isinstance(value, torch.nn.Module | torch.optim.Optimizer):
         value = value.state_dict()

@@ -48,7 +48,9 @@ def _kernels(function: np.ufunc) -> dict[str, Callable[..., torch.Tensor]]:
 
     def new(values: torch.Tensor) -> torch.Tensor:
         if values.dtype in _KNOWN_TO_NUMPY:
+            # torch gives NaN and infinity in silence.
             with np.errstate(all="ignore"):
+                # asarray: of a tensor without dimensions NumPy makes a scalar.
                 return torch.from_numpy(np.asarray(function(values.detach().numpy())))
         if values.dtype.is_floating_point:  # halves
             return new(values.float()).to(values.dtype)

@@ -63,8 +63,10 @@ class Ensemble:
         for n_in, n_out in itertools.pairwise(sizes):
             weight = torch.empty(settings.members, n_in, n_out)
             for member in weight:
+                # SB3's gains of an actor-critic's hidden layers and of its value.
                 torch.nn.init.orthogonal_(member, gain=np.sqrt(2.0) if n_out != 1 else 1.0, generator=random)
             self._parameters += [weight.requires_grad_(), torch.zeros(settings.members, 1, n_out, requires_grad=True)]
+        # eps: SB3's for actor-critics.
         self._optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, eps=1e-5)
 
     def update(self, shards: Sequence[Shard], statistics: Statistics, *, round: int) -> dict[str, float]:
@@ -79,6 +81,7 @@ class Ensemble:
         losses = []
         for _ in range(self._settings.n_batches):
             batch = torch.as_tensor(random.choice(len(inputs), size=size, replace=False))
+            # The sum over members: each has the gradient that it would have alone.
             loss = ((self._forward(inputs[batch]) - returns[:, batch]) ** 2).mean(dim=1).sum()
             self._optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -160,6 +163,7 @@ class Ensemble:
         following = behind[:, -1]
         for time in range(len(rewards) - 1, -1, -1):
             mixed = (1 - trace) * behind[:, time] + trace * following
+            # No trace leads across an end: there `behind` is 0, or the value of the truncated state.
             returns[:, time] = rewards[time] + gamma * np.where(ended[time], behind[:, time], mixed)
             following = returns[:, time]
         return returns

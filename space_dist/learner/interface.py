@@ -142,6 +142,7 @@ class SB3Learner(abc.ABC):
         )
         with _seeded(seed, Purpose.INITIAL_NETWORK):
             self.model = self._build(observation_space, action_space)
+        # SB3 makes its logger in `learn()`, which is never called here, and `train()` records into one.
         self.model.set_logger(Logger(folder=None, output_formats=[]))
 
     @abc.abstractmethod
@@ -254,6 +255,7 @@ class SB3Learner(abc.ABC):
             for name, value in recorded.items()
             if isinstance(value, int | float | np.number) and np.isfinite(value)
         }
+        # Else this update's numbers would stand in the next one's, where that records fewer.
         recorded.clear()
         return Update({**metrics, **self._more_metrics(metrics)}, self._gradient_steps() - before, self._advantages)
 
@@ -262,6 +264,7 @@ class SB3Learner(abc.ABC):
 
     def _gradient_steps(self) -> int:
         """Steps that the optimiser of the scored network has made so far."""
+        # Of the scored network: without a step of its own no set may grow (docs/algorithm.md, decision 5).
         first = next(iter(self._optimizers().values()))
         return max((int(state["step"]) for state in first.state.values()), default=0)
 
@@ -282,6 +285,7 @@ class SB3Learner(abc.ABC):
         if self._config.import_path is None:
             return arrays, data
         with _seeded(self._seed, Purpose.INITIAL_NETWORK):
+            # As a resumed run would make it.
             twin = self._build(self.model.observation_space, self.model.action_space)
         columns, own = custom.saved(self.model, twin, self._config)
         return {**arrays, **{f"own/{name}": array for name, array in columns.items()}}, {**data, "own": own}

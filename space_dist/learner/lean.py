@@ -173,6 +173,7 @@ class Network:
             for parameter, weight, mean, square in zip(self._parameters, weights, means, squares, strict=True):
                 parameter.copy_(weight.view_as(parameter))
                 self._policy.optimizer.state[parameter] = {
+                    # As torch's Adam keeps it, so that a stock run can go on from a lean one's checkpoint.
                     "step": torch.tensor(float(steps)),
                     "exp_avg": mean.view_as(parameter), "exp_avg_sq": square.view_as(parameter),
                 }  # fmt: skip

@@ -74,10 +74,12 @@ class Networks:
             for name, weight in self._split(m, 0, layout, list(self._named)).items():
                 self._named[name].copy_(weight)
         for optimizer, names, count in zip(self._optimizers, self._optimised, steps, strict=True):
+            # An optimiser that has made no step has no state (TD3's actor before `policy_delay`).
             if count:
                 means, squares = (self._split(m, behind * layout.plan.length, layout, names) for behind in (2, 3))
                 for name in names:
                     parameter = self._named[name]
+                    # As torch's Adam keeps it: checkpoints of stock and lean are interchangeable.
                     optimizer.state[parameter] = {
                         "step": torch.tensor(float(count)), "exp_avg": means[name].to(parameter.dtype),
                         "exp_avg_sq": squares[name].to(parameter.dtype),

@@ -54,6 +54,7 @@ class OffPolicyLearner(SB3Learner):
         config = self._settings
         settings = {name: value for name, value in dict(config).items() if name not in _OURS}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
+            # SB3's DQN clips in any case: an infinite norm clips nothing.
             settings["max_grad_norm"] = float("inf")
         if isinstance(config, SACConfig):  # SB3's "auto" asks an environment for this number
             settings["target_entropy"] = float(-np.prod(action_space.shape or ()))
@@ -69,6 +70,7 @@ class OffPolicyLearner(SB3Learner):
             _init_setup_model=False,
             **settings,
         )
+        # SB3 takes these from an environment, and there is none: `env=None`.
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, 1
         set_up(model, config)
         off_policy: OffPolicyAlgorithm = model
@@ -87,8 +89,10 @@ class OffPolicyLearner(SB3Learner):
         for step in range(before + 1, steps + 1):
             self.model.num_timesteps = step
             self.model._update_current_progress_remaining(step, self._total_steps)
+            # DQN copies its target network, and lets epsilon fall, in `_on_step`, once a step, and not in `train()`.
             self.model._on_step()
         ratio = self._settings.gradient_steps_per_step
+        # What a ratio leaves over counts in a later round, and needs no state.
         gradient_steps = math.floor(steps * ratio) - math.floor(before * ratio)
         if steps > self._settings.learning_starts and gradient_steps:
             self.model.train(batch_size=self._settings.batch_size, gradient_steps=gradient_steps)
@@ -168,6 +172,7 @@ class DQNLearner(OffPolicyLearner):
     def save(self) -> tuple[Arrays, dict[str, Any]]:
         """See `Learner`."""
         arrays, data = super().save()
+        # SB3 copies the target network by this count.
         return arrays, {**data, "n_calls": self.model._n_calls}  # type: ignore[attr-defined]
 
     def load(self, arrays: Mapping[str, NDArray[Any]], data: Mapping[str, Any]) -> None:
@@ -265,6 +270,7 @@ def _transitions(shard: Shard) -> dict[str, NDArray[Any]]:
         "actions": flat(shard.actions),
         "rewards": flat(shard.rewards).astype(np.float32),
         "dones": flat(shard.terminated | shard.truncated).astype(np.float32),
+        # SB3's buffer takes these off `dones` as it samples: what was truncated is bootstrapped.
         "timeouts": flat(shard.truncated).astype(np.float32),
     }
 

@@ -70,6 +70,7 @@ class OnPolicyLearner(SB3Learner):
         config = self._settings
         settings = {name: value for name, value in dict(config).items() if name not in _OURS}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
+            # SB3 clips in any case: an infinite norm clips nothing.
             settings["max_grad_norm"] = float("inf")
         algorithm: Any = LeanPPO if self._compiled else algorithm_class(config)
         model = made(
@@ -84,6 +85,7 @@ class OnPolicyLearner(SB3Learner):
             _init_setup_model=False,
             **settings,
         )
+        # SB3 takes these from an environment, and there is none: `env=None`.
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, self._n_slots
         set_up(model, config)
         on_policy: OnPolicyAlgorithm = model
@@ -119,6 +121,7 @@ class OnPolicyLearner(SB3Learner):
             advantages = self.fill(shards).advantages  # before `train` lays them out in its own way
         self._advantages = np.abs(advantages, dtype=np.float64) * self.statistics.reward_std
         self.model.num_timesteps = steps
+        # SB3 does this in its own collecting, which never runs here.
         self.model._update_current_progress_remaining(steps, self._total_steps)
         self.model.train()
 
@@ -135,6 +138,7 @@ class OnPolicyLearner(SB3Learner):
             flat = each(lambda array: array.reshape(length * n_slots, *array.shape[2:]), observations)
             flat_actions = torch.as_tensor(actions.reshape(length * n_slots, -1).astype(np.float32))
             if isinstance(self.model.action_space, spaces.Discrete):
+                # As SB3's `train()` does: its buffer keeps numbers of actions as floats.
                 flat_actions = flat_actions.long().flatten()
             beyond = [shard.truncated_observations for shard in shards]
             beyond.append(concatenate([shard.last_observations for shard in shards]))
@@ -152,6 +156,7 @@ class OnPolicyLearner(SB3Learner):
         buffer.episode_starts[:] = np.concatenate([joined.starts[None], ended[:-1]])
         buffer.values[:] = values.reshape(length, n_slots)
         buffer.log_probs[:] = log_probs.reshape(length, n_slots)
+        # SB3's `get` refuses a buffer that is not full.
         buffer.pos, buffer.full = length, True
         buffer.compute_returns_and_advantage(last_values=torch.as_tensor(last_values), dones=ended[-1])
         return buffer

@@ -143,6 +143,7 @@ class PPO:
         self._clip = column(stack, (one.clip_range for one in settings))
         self._low = column(stack, (1.0 - one.clip_range for one in settings))
         self._high = column(stack, (1.0 + one.clip_range for one in settings))
+        # SB3 stops an update at 1.5 `target_kl`.
         self._limits = column(stack, (1.5 * one.target_kl for one in settings))[:, 0]
         self._watched = any(math.isfinite(one.target_kl) for one in settings)
         normalized = column(stack, (float(one.normalize_advantage) for one in settings), torch.float32)
@@ -234,6 +235,7 @@ class PPO:
 
     def gradient_step(self) -> None:
         """Clip each member's gradient, and let its Adam make a step."""
+        # 1e-6: as torch's `clip_grad_norm_`.
         norms = torch.linalg.vector_norm(self._stack.gradient, dim=(1, 2)).add_(1e-6)
         self._stack.gradient.mul_(torch.div(self._max_norm[:, 0], norms).clamp_(max=1.0)[:, None, None])
         self._adam.step()

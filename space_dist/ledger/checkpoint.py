@@ -108,6 +108,7 @@ def _digest(meta: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
     digest = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
     for name in sorted(arrays):
         array = arrays[name]
+        # Type and shape as well: the same bytes may be another array.
         digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -120,6 +121,7 @@ def encode_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         for name, array in arrays.items():
             content = io.BytesIO()
             np.lib.format.write_array(content, np.asanyarray(array), allow_pickle=False)
+            # A ZipInfo of its own has a fixed date (1980): equal arrays make equal bytes.
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getbuffer())
     return buffer.getvalue()
 
@@ -131,6 +133,7 @@ def decode_arrays(content: bytes) -> dict[str, NDArray[Any]]:
             infos = archive.infolist()
             if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
                 raise ValueError("compressed")
+            # Before anything is unpacked: a small file may claim to hold terabytes.
             if sum(info.file_size for info in infos) > len(content):
                 raise ValueError("sizes do not add up")
             names = [info.filename.removesuffix(".npy") for info in infos]

@@ -101,6 +101,7 @@ class Ledger:
             status = Status(**data)
             if status.checkpoint is not None and not _CHECKPOINT.fullmatch(status.checkpoint):
                 raise ValueError("it names what is no checkpoint")
+            # A status may be a stranger's: `../x` would have files outside of the folder read.
             if any(Path(name).name != name for name in status.files):
                 raise ValueError("it names files elsewhere")
             return status

@@ -58,6 +58,7 @@ def believed_alive(owner: Mapping[str, Any]) -> bool:
     same_kernel = here["boot_id"] and owner.get("boot_id") == here["boot_id"]
     if same_kernel and owner.get("pid_namespace") == here["pid_namespace"]:
         pid, started = owner.get("pid"), owner.get("started")
+        # The start tells a process from a later one with the same number.
         return isinstance(pid, int) and started is not None and _started(pid) == started
     try:
         return abs(time.time() - float(owner["heartbeat"])) < LEASE_SECONDS  # clocks of two hosts differ
@@ -96,9 +97,11 @@ def _decoded_owner(content: bytes) -> dict[str, Any]:
 def _started(pid: int) -> int | None:
     """When a living process began, in clock ticks since boot: unlike a time of day, no clock setting changes it."""
     try:
+        # Behind the last parenthesis: a command's name, which stands in parentheses, may hold some itself (proc(5)).
         fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:
         return None
+    # A zombie works on nothing. Field 22 of the file, `starttime`, is the 20th behind the name.
     return None if fields[0] == b"Z" else int(fields[19])
 
 
@@ -130,6 +133,7 @@ class Lock:
         file.write(content)
         file.truncate()
         file.flush()
+        # Others decide by what is on disk, on other hosts as well.
         os.fsync(file.fileno())
 
     def _is_mine(self, owner: Mapping[str, Any]) -> bool:
@@ -205,6 +209,7 @@ class Lock:
             return
         self._stop.set()
         if self._thread is not None:
+            # Else a beat that is under way would write the claim anew behind the release.
             self._thread.join()
             with contextlib.suppress(OSError), self._locked_file(OWNER_SECONDS) as file:
                 if self._is_mine(self._read(file)):

@@ -21,6 +21,7 @@ _CRC_LENGTH = len(',"crc":"00000000"}\n')
 
 def encode_row(row: Row) -> bytes:
     """One line: the row as JSON with its own CRC-32 as last field."""
+    # NaN is no JSON: other readers than Python's refuse a file that has it.
     body = json.dumps(row, separators=(",", ":"), allow_nan=False)
     return f'{body[:-1]},"crc":"{zlib.crc32(body.encode()):08x}"}}\n'.encode()
 

@@ -63,6 +63,7 @@ class RunWriter:
                     for left_behind in folder.glob(TEMPORARIES):  # by a process that was killed while it wrote
                         left_behind.unlink()
             except BaseException:
+                # `with` calls no `__exit__` for what fails in `__enter__`.
                 self._lock.release()
                 raise
         return self
@@ -126,6 +127,7 @@ class RunWriter:
             name = self.ledger.config.name
             both = sorted({*files.get(name, []), hashlib.sha256(config.encode()).hexdigest()})
             self._write_status(dataclasses.replace(status, files={**status.files, name: both}))
+            # Behind the status, which no longer names them.
             for file in forgotten:
                 file.unlink()
         return status
@@ -150,6 +152,7 @@ class RunWriter:
             if reasons:
                 log.warning("going back to the checkpoint of round %d (%s)", checkpoint.round, "; ".join(reasons))
             with _clear_errors(self.ledger.folder), self._lock.held():
+                # In this order: a kill in between leaves a status whose checkpoint and rows are there.
                 self._point_at(file.name, content, checkpoint)
                 self._cut(prefixes)
                 for newer in files[: files.index(file)]:
@@ -227,6 +230,7 @@ class RunWriter:
         ):
             file.write(line)
         self._sizes[name] += len(line)
+        # Kept up row by row: hashing whole files at every commit would cost more, the longer a run is.
         self._hashes[name].update(line)
 
     def commit(self, checkpoint: Checkpoint, status: Status) -> None:
@@ -243,6 +247,7 @@ class RunWriter:
             data = {**checkpoint.data, "files": files, "about": about}
             content = encode_checkpoint(dataclasses.replace(checkpoint, data=data))
             path = self.ledger.checkpoints / f"round-{checkpoint.round:09d}.npz"
+            # Rows, checkpoint, status: each names only what is on disk before it.
             atomic_write(path, content)
             self._write_status(
                 dataclasses.replace(
@@ -252,6 +257,7 @@ class RunWriter:
                     checkpoint_sha256=hashlib.sha256(content).hexdigest(),
                 )
             )
+            # Last: until the status names the new one, the one before it is what a killed run goes on from.
             for old in self.ledger.checkpoint_files()[KEPT_CHECKPOINTS:]:
                 old.unlink()
             self._named[path.name] = {segment.name for segment in checkpoint.segments}

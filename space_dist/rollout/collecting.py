@@ -199,6 +199,7 @@ def collect(
         table.end(ended, time, step.success)
         if table.overdue(time + 1, env.horizon):
             raise endless(env)
+        # Behind an episode's end this is void: `recording` has kept what is truncated, and a reset comes first.
         put(current, slice(None), step.observations)
 
     shards = recording.shards(rollouts, table, walking.begun, starts, current)
@@ -245,6 +246,7 @@ def replayed(env: BatchedEnv, table: EpisodeTable) -> Observations:
         if len(ended):
             slot = ended[0] if own[ended[0]] else leader
             raise _another_way(f"ended after {time + 1 - begins[slot]} steps, and had gone on for {lengths[slot]}")
+    # Equal to the bit or not at all; NaN, as a diverged run's, is equal to itself here.
     differ = np.flatnonzero(table.runs & (returns != table.returns) & ~(np.isnan(returns) & np.isnan(table.returns)))
     if len(differ):
         slot = differ[0]

@@ -30,6 +30,7 @@ def curriculum_episodes(train: InstanceSet, shards: Sequence[Shard], advantages:
     unknown = np.full(len(ids), np.nan)
     running = np.concatenate([shard.unfinished.ids[shard.unfinished.lengths > 0] for shard in shards])
     return Episodes(
+        # Instance sets are sorted by id.
         indices=np.where(ids == GENERATED, GENERATED, np.searchsorted(train.ids, ids)), contexts=column("contexts"),
         returns=column("returns"), discounted_returns=column("discounted_returns"), lengths=column("lengths"),
         success=column("success"), start_values=unknown, advantages=unknown if advantages is None else advantages,

@@ -70,6 +70,7 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
     contexts = np.concatenate([trial.contexts for trial in trials])
     seeds = np.concatenate([trial.seeds for trial in trials])
     gamma = np.repeat([trial.gamma for trial in trials], count)
+    # Copied: what an environment returns may be its own memory.
     observations = take(env.reset(slots, contexts, seeds), slice(None))
     alive = np.ones(n_slots, dtype=np.bool_)
     returns, discounted, success = np.zeros(n_slots), np.zeros(n_slots), np.full(n_slots, np.nan)
@@ -80,6 +81,7 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
         outputs = acting.outputs(observations)
         chosen = acting.head.best(outputs) if noise is None else acting.head.sampled(outputs, noise, time, trained)
         step = env.step(acting.head.executed(chosen))
+        # Horner's rule for the released code's metric, sum r_t gamma^(T-1-t).
         backward = np.where(alive, gamma * backward + step.rewards, backward)
         time += 1
         if time == env.horizon and (alive & ~(step.terminated | step.truncated)).any():

@@ -80,13 +80,16 @@ class Head:
         if self.kind == "gaussian" and self.log_std is not None:
             sampled = outputs + np.exp(self.log_std) * drawn
         elif self.kind == "categorical":
+            # The Gumbel-max trick: with such noise on the logits, the largest is a draw from their softmax.
             sampled = np.argmax(outputs + drawn, axis=1)
         else:
+            # SB3's warm-up: uniformly random actions until learning starts.
             early = steps < self.exploration.learning_starts
             uniform = noise.uniform[time]
             if self.kind == "greedy":
                 count = outputs.shape[1]
                 explore = early | (uniform[:, 0] < self.exploration.epsilon(steps))
+                # min: in float32 the product of a number just below 1 may round up to `count`.
                 random = np.minimum((uniform[:, 1] * count).astype(np.int64), count - 1)
                 sampled = np.where(explore, random, np.argmax(outputs, axis=1))
             elif self.kind == "squashed":
@@ -219,6 +222,7 @@ class MlpPolicy:
                 best = self.head.best(forward(self.actor, self.activation, scaled)).astype(np.float32)
                 inputs = np.concatenate([scaled, best], axis=1)
             values = forward(self.critics[0], self.activation, inputs)[:, 0]
+            # The least of them, as SAC and TD3 bootstrap: a single one overestimates (Fujimoto et al. 2018).
             for critic in self.critics[1:]:
                 values = np.minimum(values, forward(critic, self.activation, inputs)[:, 0])
         scaled_values: NDArray[np.float64] = values.astype(np.float64) * self.statistics.reward_std

@@ -94,7 +94,9 @@ class Setup:
         mine = np.array_split(np.arange(count), parts_each)[part % parts_each]
         return Trial(
             self._policy(policy, part), instances.contexts[mine // self.evaluation_episodes],
+            # Drawn for the whole split and then cut: an episode's seed does not depend on the parts.
             episode_seeds(self.seed, Purpose.EVALUATION, number, count=count)[mine], self.gamma,
+            # 2 + number: keys that the seeds of episodes (0 and 1) do not have.
             functools.partial(generator, self.seed, Purpose.EVALUATION, 2 + number, part) if stochastic else None,
         )  # fmt: skip
 

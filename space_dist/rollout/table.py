@@ -116,6 +116,7 @@ class EpisodeTable:
         actions = np.concatenate([self.actions, executed]) if len(self.actions) else executed
         actions = actions[len(actions) - lengths.max() :].copy()
         early = np.arange(len(actions))[:, None] < len(actions) - lengths
+        # Zeros, so that equal episodes are equal to the bit (`Unfinished.same`), whatever ran in the slot before.
         actions[early] = 0
         found = []
         for index in range(owners):

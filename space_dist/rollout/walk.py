@@ -128,6 +128,7 @@ class Walking:
         self._ids = np.concatenate([rollout.selection.ids for rollout in rollouts])
         self._contexts = np.concatenate([rollout.selection.contexts for rollout in rollouts])
         self._seeds = np.stack([
+            # One for each step: no round can begin more episodes than that.
             episode_seeds(one.seed, Purpose.EPISODES, one.round, one.shard, count=slots * length) for one in rollouts
         ])  # fmt: skip
 
@@ -172,6 +173,7 @@ def unstacked(
     if fit:
         lengths, actions = arrays["lengths"], arrays["actions"]
         fit = (
+            # A checkpoint is hostile until it fits: these numbers decide how many steps are played again.
             bool(((lengths >= 0) & (lengths < horizon)).all())
             and actions.dtype.kind in "if"
             and actions.shape == (shards, lengths.max(), slots, *action_shape)

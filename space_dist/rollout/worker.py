@@ -106,6 +106,7 @@ class Worker:
         """On an environment of its own, so that measuring never changes what is collected."""
         if not len(trial):
             return Outcomes.none(trial.policy.version)
+        # One environment for each number of slots: parts of a split differ by one episode at most.
         if len(trial) not in self._evaluating:
             self._evaluating[len(trial)] = self._make(len(trial))
         return evaluate(self._evaluating[len(trial)], [trial])[0]
@@ -128,5 +129,6 @@ def start_observations(setup: Setup, chunk: int) -> Observations:
     contexts = setup.train.contexts[first : first + setup.chunk_size]
     contexts = np.repeat(contexts, setup.start_states, axis=0)
     with setup.spec.opened(len(contexts)) as env:
+        # By chunk, whoever scores it: no result depends on which worker that is.
         seeds = episode_seeds(setup.seed, Purpose.START_STATES, chunk, count=len(contexts))
         return take(env.reset(np.arange(len(contexts)), contexts, seeds), slice(None))

@@ -61,6 +61,7 @@ class Blueprint:
 
     def _with_engine(self, can_share: bool) -> RunConfig:
         config, spec = self.config, self.spec
+        # A config that asks for `lean` keeps the update it names; with a population `overlap` gains nothing.
         stock = not config.learner.is_compiled("single")
         engine = "population" if can_share and stock and not config.rollout.overlap else "single"
         try:
@@ -100,6 +101,7 @@ class Blueprint:
             keep_next_observations=config.learner.keeps_next_observations,
             policies=config.n_policies,
         )
+        # Before the run's folder is touched: what cannot be leaves nothing behind.
         self._refuse_short_budget()
         refuse_spaces(config.learner, spec.observation_space, spec.action_space)
         if config.engine == "population":
@@ -168,6 +170,7 @@ class Blueprint:
         if config.engine != "population" or not config.learner.can_be_stacked:
             return 0
         each = member_bytes(config.learner, spec.observation_space, spec.action_space, config.device)
+        # Rounded up: 0 would mean that the run works alone.
         return -(-config.n_policies * each >> 20)
 
     def policy_in(self, checkpoint: Checkpoint) -> Policy | Several:
@@ -195,6 +198,7 @@ class Blueprint:
 
     def _refuse_equal_starts(self, train: InstanceSet) -> None:
         settings = self.config.curriculum
+        # Decision 10 of docs/algorithm.md.
         if settings.ranks_by_start_value and self.spec.starts_alike(train.contexts[:_COMPARED_STARTS]):
             raise ConfigError(
                 f"curriculum.kind: {settings.kind} ranks instances by the value of their start, but all instances "

@@ -103,6 +103,7 @@ def n_workers(config: RunConfig, spec: EnvironmentSpec) -> int:
     if isinstance(resources.workers, int):
         return resources.workers
     if resources.address != "local":
+        # That Ray is up already, so it costs no start: as many as can share a round.
         return config.rollout.shards
     most = min(config.rollout.shards, cores())  # the run's own process waits while they collect
     return most if spec.one_by_one and most > 1 and config.budget.steps >= _WORTH_RAY else 0
@@ -122,6 +123,7 @@ class CurriculumHost:
         """The first decision and V_0."""
         state, selection = self.curriculum.start()
         values = checked(np.concatenate(chunks), "start values")
+        # `v0: zero`: line 2 of Algorithm 1 as printed; decision 3 of docs/algorithm.md says why it is no default.
         return state, selection, {}, np.zeros_like(values) if self._from_zero else values
 
     def decide(
@@ -136,6 +138,7 @@ class CurriculumHost:
             raise RuntimeError(f"asked to go on from selection {version} with the state of {state.version}")
         arriving = iter(pieces)
         seen = {name: [next(arriving) for _ in range(count)] for name, count in layout.items()}
+        # A comparison with NaN is false: unchecked, a curriculum would go on in silence.
         after = checked(np.concatenate(seen["after"]), "start values")
         if seen.get("rescored"):
             before = checked(np.concatenate(seen["rescored"]), "start values")
@@ -161,6 +164,7 @@ class CurriculumHost:
         if indices is None:
             raise RuntimeError(f"selection {state.version} was probed, and nobody asked for that")
         outcomes = joined(parts)
+        # `Blueprint` has asked one instance's first step only.
         if np.isnan(outcomes.success).any():
             raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)

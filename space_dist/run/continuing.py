@@ -19,6 +19,7 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
         return False
     if new.episodes is not None and (old.episodes is None or new.episodes < old.episodes):
         return False
+    # Rows and checkpoints that are there must be those that the larger budget would have given.
     reason = _goes_by_budget(before)
     if reason is not None:
         raise ConfigError(

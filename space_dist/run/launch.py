@@ -89,6 +89,7 @@ def launch(
             with _cluster(active, waiting) as cluster:
                 waiting("preparing the learner")
                 active.training(cluster, observe).run()
+    # The lock is free by now: a server that hangs keeps nobody from the run.
     if active.pusher is not None:
         waiting(f"mirroring to MLflow, for {_FINAL_PUSH_SECONDS:.0f} s at most")
     return active.finished()
@@ -145,8 +146,10 @@ def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) 
 @contextlib.contextmanager
 def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
+    # `auto` is settled here, once: stored, it means the same server wherever the run is resumed.
     config = config.model_copy(update={"tracking": settled(config.tracking, "space_dist")})
     ledger, blueprint = Ledger(folder), Blueprint.of(config)
+    # Whatever the config cannot do is refused before the folder is written to.
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
     if ledger.exists() and not resume:
@@ -211,6 +214,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
         status = replace(
             status, steps=before.steps, round=before.round, started_at=before.started_at,
+            # Once marked, always marked: rows from then on are in the results.
             fingerprint_changed=before.fingerprint_changed or changed,
             identity=before.identity if before.identity and shorter is None else status.identity,
         )  # fmt: skip
@@ -219,7 +223,9 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         now_at = writer.hand_over(status, stored, within(shorter, blueprint.spec.horizon))
         status = replace(status, steps=now_at.steps, round=now_at.round)
         log.info("going on under a larger budget, from round %d", status.round)
+    # Before the status, which names the digests of these files.
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
+    # It asked the process before this one.
     ledger.stop_file.unlink(missing_ok=True)
     writer.set_status(status)
     return status
@@ -259,6 +265,7 @@ def _status_before(ledger: Ledger) -> Status | None:
 def _status_in(ledger: Ledger) -> Status | None:
     """A status from the newest intact checkpoint, which knows what decides whether and how the run may go on."""
     for file in ledger.checkpoint_files():
+        # A damaged one: the one before it may be intact.
         with contextlib.suppress(ValueError, OSError):
             checkpoint = decode_checkpoint(file.read_bytes())
             about, now = checkpoint.data.get("about", {}), time.time()
@@ -340,6 +347,7 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
         try:
             description = json.loads(described)
             if description["policy"] != "torch":  # those come from the last checkpoint, below
+                # Never pickle: the folder may be a stranger's.
                 with np.load(io.BytesIO(content), allow_pickle=False) as file:
                     return from_arrays(dict(file), description)
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError):
@@ -465,6 +473,7 @@ def _logging_to(path: Path) -> Iterator[None]:
     except OSError as error:
         raise LedgerError(f"cannot write {path}: {in_words(error)}") from None
     handler.handleError = lambda record: None  # type: ignore[method-assign] # a full disk is the ledger's to tell
+    # Runs of a population share a process and its logger: each log has its own run's lines.
     handler.addFilter(lambda record: speaking.get() in (None, path.parent))
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     log.addHandler(handler)

@@ -55,6 +55,7 @@ def advance(
         token = speaking.set(folder)
         work = members[folder]
         try:
+            # Thrown into the member, whose own handlers note the failure in its status.
             asked[folder] = work.throw(answer) if isinstance(answer, Exception) else work.send(answer)
         except StopIteration as stop:
             ended(folder, stop.value)
@@ -74,6 +75,7 @@ def advance(
                 go_on(folder, answer)
     finally:
         shop.close()
+        # Closed generators release their ledgers' locks.
         for work in members.values():
             work.close()
 
@@ -137,9 +139,11 @@ class _Promise:
     def batch(self) -> Hashable:
         """Equal for what can be computed at once."""
         setup = self.setup
+        # Sorted: the same arguments in another order make the same environment.
         env = (setup.spec.env_id, json.dumps(dict(setup.spec.kwargs), sort_keys=True), setup.spec.context_visible)
         if isinstance(self.work, Rollout):
             return ("collect", *env, setup.slots, setup.slot_length)
+        # Noisy and deterministic trials act by different calls of a policy's head.
         return ("measure", *env, len(self.work), self.work.random is None)
 
     @property
@@ -256,6 +260,7 @@ class _Workshop:
 
     def _keep_spare(self, key: Hashable, env: BatchedEnv) -> None:
         self._spare[key] = [*self._spare.pop(key, []), env]
+        # Members end and sizes of batches change: unbounded, every size ever met would stay in memory.
         while sum(map(len, self._spare.values())) > _KEPT:
             self._drop_oldest()
 

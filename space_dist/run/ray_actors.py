@@ -47,8 +47,10 @@ class RolloutActor(_Timed, Worker):
 
     def __init__(self, setup: Setup, folders: Sequence[str]) -> None:
         look_in(folders)
+        # Ray sets OMP_NUM_THREADS alone, and products of matrices have other bits with other numbers of threads.
         threadpool_limits(limits=1)
         super().__init__(setup)
+        # Here and not in the first call: an environment that cannot be made is told while actors start.
         self.make_first()
 
 

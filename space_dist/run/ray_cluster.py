@@ -58,6 +58,7 @@ _CENTRAL_ANSWERS = 4  # state, selection, numbers, values
 log = logging.getLogger("space_dist")
 
 
+# eq=False: told apart by identity, as members of sets and keys; values are arrays.
 @dataclass(eq=False)
 class _RemoteValue:
     """A handle: where a value is, or will be. Recomputing the value moves it.
@@ -133,6 +134,7 @@ class RayCluster:
             self._start((*range(self._workers), CENTRAL))
             while self._starting:
                 self._look_after_starting()
+        # Python calls no `__exit__` for what fails in `__enter__`.
         except BaseException:
             self._watch.close()
             raise
@@ -200,6 +202,7 @@ class RayCluster:
         while True:
             self._wait_for_answers()
             try:
+                # A timeout is a RayError as well: what does not arrive in time is computed again.
                 values = ray.get([remote.ref for remote in wanted], timeout=self._resources.first_answer_seconds)
                 break
             except RayTaskError as error:
@@ -339,6 +342,7 @@ class RayCluster:
                 options["runtime_env"] = {"env_vars": chosen}
             setup = self._remote_setup.ref
             self._actors[index] = (
+                # Not counted: a run takes 1 + resources.workers CPUs (docs/grids.md).
                 ray.remote(num_cpus=0, **options)(CurriculumActor).remote(self._config, setup, folders_of_user())
                 if index == CENTRAL
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
@@ -384,6 +388,7 @@ class RayCluster:
         cause = None if error is None else error.__cause__
         self._failed_starts[index] += 1
         if isinstance(cause, SpaceDistError):
+            # Our own sentence (another arithmetic, a config's fault) would be the same at every attempt.
             raise cause
         if isinstance(cause, RayTaskError) and not _is_loss(cause):  # its environment's or policy's own fault
             raise _cause(cause) from error
@@ -398,6 +403,7 @@ class RayCluster:
 
     def _take_room(self, workers: int, seconds: float) -> bool:
         """Hold one CPU for each rollout actor, near to each other; False if there is no room within the time."""
+        # One group, all or nothing: two runs that each hold half of the CPUs would wait for each other for ever.
         self._room = placement_group([{"CPU": 1.0}] * workers, strategy="PACK")
         if self._room.wait(max(1.0, seconds)):
             return True

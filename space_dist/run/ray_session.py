@@ -72,6 +72,7 @@ def join_ray(
         raise_if_stopped()
         try:
             if not ours:
+                # `ray.init` itself gives up on an address where nobody answers only after 824 s.
                 reach(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address, raise_if_stopped)
             with (
                 _turn_to_start(raise_if_stopped) if ours else contextlib.nullcontext(),
@@ -110,6 +111,7 @@ def attended(
     where = "of our own" if started else f"at {address!r} (resources.address, or --address)"
     addresses = parts(ray.nodes(), found["node_id"], found["gcs_address"])  # type: ignore[no-untyped-call]
     if started is not None:
+        # While its parents live: whose parent has died can no longer be told.
         started.look()
     try:
         with watched(addresses, where, started, gone=gone, note=note):
@@ -130,6 +132,7 @@ def _turn_to_start(raise_if_stopped: Callable[[], None]) -> Iterator[None]:
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as turn:
         until = time.monotonic() + _TURN_SECONDS
+        # Abstract sockets are Linux's alone (unix(7)). Out of time, it starts all the same: turns only save time.
         while sys.platform == "linux" and time.monotonic() < until:
             try:
                 turn.bind(f"\0space_dist starts a Ray for {os.getuid()}")

@@ -122,6 +122,7 @@ class Started:
         numbers = [str(process.pid) for process in raylets]
         try:
             subprocess.Popen(
+                # -I and -S: it imports nothing of the user, whose folder or environment may be what failed.
                 [sys.executable, "-I", "-S", "-c", _KILL_BEHIND, str(os.getpid()), *numbers], start_new_session=True,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
@@ -208,6 +209,7 @@ def _watch(
         took, last = min(now - last, 1.5 * (len(addresses) * _ASK_SECONDS + _PAUSE_SECONDS)), now
         for name, answer in found.items():
             if answer == "answers":
+                # A busy Ray answers now and then: only unbroken silence counts.
                 since[name] = dict.fromkeys(limits, 0.0)
                 continue
             since[name][answer] += took
@@ -236,6 +238,7 @@ def _end(sentence: str, started: Started | None, code: int, note: Note) -> None:
         if started is not None:
             started.end_with_us()
     finally:
+        # `sys.exit` would end this thread alone.
         os._exit(code)
 
 

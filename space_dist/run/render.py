@@ -112,6 +112,7 @@ class Gallery:
         self._seeds = {
             split: episode_seeds(
                 self._config.seed, Purpose.EVALUATION, index, count=len(self._sets[split]) * episodes
+            # The first episode of each instance, of those that evaluation plays.
             )[::episodes]
             for episodes in [self._config.evaluation.episodes]
             for index, split in enumerate(_SPLITS)
@@ -173,6 +174,7 @@ class Gallery:
         columns = min(PANELS, len(shown))
         rows = math.ceil(len(shown) / columns)
         figure = Figure(figsize=(max(2.0 * columns, 6.0), 2.25 * rows + 0.7), layout="constrained", facecolor="white")
+        # Not pyplot, which keeps every figure alive until somebody closes it.
         FigureCanvasAgg(figure)
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in panels[len(shown) :]:
@@ -197,6 +199,7 @@ class Gallery:
         """One deterministic episode; `frames` takes pictures of its start, of every so many steps and of its end."""
         env, world, instances = self._env, unwrapped(self._env), self._sets[split]
         context = instances.contexts[place : place + 1]
+        # Scenes draw the state; the context is at the end of an observation where the policy sees it.
         n_features = context.shape[1] if self._config.env.context_visible else 0
 
         def look(over: bool) -> None:

@@ -12,6 +12,7 @@ from space_dist.ledger import Ledger, decode_arrays, encode_arrays
 from space_dist.system.files import read_file
 
 _WEIGHTS: Final = re.compile(r"(?:\d+/)?(?:policy/.*|normaliser/(?!running$).*)")  # of what a learner saves
+# A file that somebody names is read whole into memory: bounded.
 _MAX_BYTES: Final = 4 << 30
 
 
@@ -59,6 +60,7 @@ def start_from(learner: Learner, weights: bytes) -> None:
                 f"init_from: {name!r} has the shape {given[name].shape} in that run, and {own[name].shape} here: "
                 f"{_ALIKE}"
             )
+    # Whatever was not given stays fresh: optimisers, counters, running returns.
     learner.load({**arrays, **given}, data)
 
 

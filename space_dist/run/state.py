@@ -35,6 +35,7 @@ def _under(folder: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 def _walk_in(name: str, checkpoint: Checkpoint, setup: Setup) -> Walk:
     order_version, positions = checkpoint.data["run"][name]
+    # Before the first round nothing is under way.
     if not positions:
         return Walk(order_version, ())
     return Walk(

@@ -59,6 +59,7 @@ from space_dist.run.state import RunState
 
 log = logging.getLogger("space_dist")
 
+# A number that no real round reaches, so that its seeds are nobody else's.
 SCALES_ROUND = (1 << 32) - 1  # the round in which first scales are measured
 
 
@@ -167,16 +168,20 @@ class Training:
         checkpoint = self._writer.restore()
         policy = self._restore(checkpoint) if checkpoint else (yield from self._begin())
         run = self._run
+        # Line 4 of Algorithm 1, in rounds: an iteration is several of them (decision 8 of docs/algorithm.md).
         while not self._is_over():
             shards: list[Shard] = yield from self._settle(asked.ahead or self._collect(policy, lag=0))
             asked.ahead, acted, scales = [], run.acted, self.learner.statistics  # of the weights that acted
             self._arrived(shards, lag=1 if acted else 0)
             run.acted = self._look_ahead(policy)
+            # Line 5, with SB3's own `train()`.
             update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted or None)
             self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
+            # Lines 6 to 13.
             if run.rounds_left == 0:
                 yield from self._decide(policy)
+            # By steps, not by passes as the paper's: those are of another length for each curriculum (decision 14).
             if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
                 self._evaluate(policy)
             self._show()
@@ -187,6 +192,7 @@ class Training:
         """Whether another round, and `reserved` steps before it, would exceed the budget."""
         run, budget = self._run, self._config.budget
         enough = budget.episodes is not None and run.episodes >= budget.episodes
+        # A round at its longest must fit: the budget is never exceeded.
         return enough or run.steps + reserved + self._config.round_steps(self._horizon) > budget.steps
 
     # ---- the parts of an iteration ----
@@ -199,6 +205,7 @@ class Training:
         elif self.learner.normalises:
             yield from self._measure_scales()
         policy = cluster.put(self.learner.policy(0))
+        # V_0 of the initial network, not the printed 0 (decision 3 of docs/algorithm.md).
         first = cluster.begin(cluster.start_values(policy))
         self._adopt(first)
         bounds = self._setup.spec.context_bounds
@@ -278,6 +285,7 @@ class Training:
         if indices is None or self._is_over(reserved=len(indices) * self._horizon):
             return []
         outcomes: list[Outcomes] = yield from self._settle(cluster.probe(policy, indices, version=run.version))
+        # Rivals that play no probes get as many steps in all.
         run.steps += sum(int(part.lengths.sum()) for part in outcomes)
         return outcomes
 
@@ -285,6 +293,7 @@ class Training:
         """What this iteration showed, as far as the curriculum asks for it: handles, not waited for."""
         run, cluster, wants = self._run, self._cluster, self._curriculum.wants
         rescored, ensemble, episodes, context_values = [], [], [], []
+        # Zeros are on every scale.
         from_zero = run.version == 0 and self._config.curriculum.starts_from_zero
         if self.learner.normalises and not from_zero:
             # Both values at one scale: else a change of scale would look like progress.
@@ -324,6 +333,7 @@ class Training:
         config = self._config
         episodes = config.rollout.passes * len(selection.ids)
         per_round = config.n_episodes or config.learner.n_steps / self._horizon  # of each policy: all pass over it
+        # Decision 8 of docs/algorithm.md.
         return 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
 
     def _evaluate(self, policy: Handle) -> None:
@@ -342,6 +352,7 @@ class Training:
                 row[split] = _summary(outcomes, len(self._setup.instances(split)), settings.episodes)
             for split in legacy:
                 outcomes = joined([next(arrived) for _ in legacy[split]])
+                # The metric of the released code's plots: the last reward counts most.
                 returns = checked(outcomes.backward_discounted_returns, "returns")
                 row[split]["legacy_return"] = float(returns.mean())
             self._append(row)
@@ -523,6 +534,7 @@ class Training:
         arrays |= kept
         if self.ensemble is not None:
             arrays |= {f"ensemble/{name}": array for name, array in self.ensemble.save().items()}
+        # Before the checkpoint that names them.
         self._store_transitions()
         return Checkpoint(
             run.round, arrays, {"learner": learner, "curriculum": numbers, "run": data}, tuple(self._segments)
@@ -530,6 +542,7 @@ class Training:
 
     def _store_transitions(self) -> None:
         """Write what is new in the replay buffer; forget pieces that the buffer has forgotten."""
+        # Pieces are written once; a checkpoint that held the buffer would write all of it anew each time.
         learner = self.learner
         remembered = learner.seen - learner.capacity
         self._segments = [segment for segment in self._segments if segment.first + segment.count > remembered]
@@ -557,6 +570,7 @@ class Training:
             self.ensemble.load(checkpoint.under("ensemble/"))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
         if run.acted:
+            # It was in flight when the checkpoint was made: asked again with the weights that acted then.
             asked.ahead = self._collect(cluster.put(self.learner.policy_of(run.acted, run.round - 1)), lag=1)
         return cluster.put(self.learner.policy(run.round))
 

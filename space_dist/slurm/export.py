@@ -134,7 +134,9 @@ class Export:
             yield _directive("exclusive", None if profile.exclusive is True else profile.exclusive)
         yield from self._outputs(array=self.mode == "array")
         yield _directive("open-mode", "append")
+        # Said, because a site may have JobRequeue=0: without it `scontrol requeue` is refused.
         yield _directive("requeue", None)
+        # B: to the batch script alone, which tells the runs and decides about requeueing.
         yield _directive("signal", f"B:{profile.signal.name}@{profile.signal.lead_seconds}")
         if self.mode == "array":
             yield _directive("array", self.array(self.chunks[0][1]))
@@ -165,6 +167,7 @@ class Export:
     def _outputs(self, *, array: bool) -> Iterator[str]:
         files = {"output": self.profile.output, "error": self.profile.error}
         yield from _optional(
+            # %A_%a of a job that is no array would be numbers that mean nothing.
             {name: file if array or not file else file.replace("%A_%a", "%j") for name, file in files.items()}
         )
 
@@ -205,6 +208,7 @@ def export(
             written.append(folder / name)
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+    # Last: a folder with a manifest has all its scripts.
     there.freeze(grid.manifest, instances)
     return [*written, there.manifest_file]
 
@@ -302,6 +306,7 @@ def _shell_line(*words: object) -> _Safe:
 
 def _quoted(value: Any) -> Any:
     """For the shell; templates print numbers and what is safe already as they are."""
+    # `True` and `None` in a script are a template's mistake, and bash would take them for words.
     if isinstance(value, bool) or value is None:
         raise jinja2.TemplateRuntimeError(f"prints {value!r}, which is no text")
     return value if isinstance(value, (int, _Safe)) else shlex.quote(str(value))

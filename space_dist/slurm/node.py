@@ -100,6 +100,8 @@ def serve(head: str, port: int, *, cpus: int, temp: Path, interface: str | None)
 def _options(own: str, head: str, port: int, cpus: int, temp: Path) -> list[str]:
     options = [
         f"--node-ip-address={own}", f"--num-cpus={cpus}", f"--object-store-memory={_OBJECT_STORE_BYTES}",
+        # Short: Linux allows 107 bytes for a socket's path. Ports 0: as the kernel gives them; Ray's own range is
+        # the same for every Ray of a node.
         f"--temp-dir={temp / 'r'}", "--min-worker-port=0", "--max-worker-port=0", "--disable-usage-stats", "--block",
         f"--dashboard-agent-listen-port={port + 1}", "--include-log-monitor=false",
     ]  # fmt: skip
@@ -147,6 +149,7 @@ def _end_all(temp: Path) -> None:
     for process in _below():
         _kill(process)
     _reap_until(lambda: not _below(), _LOOK_SECONDS)
+    # Again: the last of Ray's processes may have written there as they ended.
     shutil.rmtree(temp, ignore_errors=True)
 
 
@@ -176,6 +179,7 @@ def _reap_until(done: Callable[[], bool], seconds: float) -> None:
     until = time.monotonic() + seconds
     while True:
         with contextlib.suppress(ChildProcessError):
+            # As subreaper we are the parent of whatever lost its own, and nobody else would reap it.
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
         if done() or time.monotonic() > until:

@@ -221,6 +221,7 @@ class Profile(Section):
 
     @model_validator(mode="after")
     def _together(self) -> Self:
+        # sbatch refuses both together, but only once the job is submitted.
         if self.mem is not None and self.mem_per_cpu is not None:
             raise ValueError("mem and mem_per_cpu exclude each other")
         if self.apptainer_options and self.apptainer is None:
@@ -282,6 +283,7 @@ def seconds(time: str | int | None) -> int | None:
     elif len(parts) == 3:
         hours, minutes, rest = parts
     else:  # MM[:SS]
+        # SLURM's own reading (sbatch(1), --time): a lone number is minutes.
         hours, minutes, rest = 0, *(*parts, 0)[:2]
     return ((24 * days + hours) * 60 + minutes) * 60 + rest
 

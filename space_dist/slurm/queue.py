@@ -51,8 +51,10 @@ def queue_of(folder: Path) -> Queue | None:
         return None
     kinds = {number: kind for kind, numbers in jobs.items() for number in numbers}
     ids = ",".join(kinds)
+    # --array: one line for each task, where squeue would otherwise put pending ones together.
     said = _ask("squeue", "--noheader", "--array", f"--jobs={ids}", "--format=%F|%T|%r")
     live = _count(said or "", kinds)
+    # --allocations: a job's steps (.batch, .extern) would be counted as jobs of their own.
     past = _ask("sacct", "--noheader", "--parsable2", "--allocations", f"--jobs={ids}", "--format=JobID,State,ExitCode")
     ended = {state: count for state, count in _count(past or "", kinds).items()
              if not any(word in state for word in ("pending", "running", "requeued"))}  # fmt: skip

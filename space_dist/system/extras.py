@@ -27,6 +27,7 @@ def needed_from(extra: Extra, what: str, instead: str = "") -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
+        # Our own fault, and no library's: no package would mend it.
         if missing == "space_dist":
             raise
         part = "" if missing in (module, f"{module}_data") else f" ({title} is here, but it lacks {missing!r})"

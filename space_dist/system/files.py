@@ -85,7 +85,9 @@ def atomic_write(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+    # rename(2) is atomic: readers see the old file or the new one.
     temporary.replace(path)
+    # A rename is on disk once its folder is (fsync(2)).
     _sync_folder(path.parent)
 
 

@@ -36,6 +36,7 @@ def look_here_too() -> None:
 
 def look_in(folders: Iterable[str]) -> None:
     """Look for modules in these folders, after everywhere else."""
+    # At the end: a user's `json.py` does not stand in for Python's.
     sys.path.extend(folder for folder in folders if folder not in sys.path)
 
 
@@ -43,6 +44,7 @@ def folders_of_user() -> list[str]:
     """Where this process looks for modules, but for what belongs to its Python: for workers of its own, elsewhere."""
     here = str(Path.cwd())
     found = dict.fromkeys([*(str(Path(entry).absolute()) for entry in sys.path), here])
+    # Other nodes have a Python of their own, at these or other places.
     pythons = (sys.prefix, sys.base_prefix)
     return [entry for entry in found if entry == here or not any(map(Path(entry).is_relative_to, pythons))]
 
@@ -66,6 +68,7 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
     if of_library is not None and isinstance(found, type) and issubclass(found, of_library):
         return found
     home = getattr(found, "__module__", None)
+    # A partial is what a user made of a library's function, with arguments of theirs.
     if isinstance(home, str) and not isinstance(found, functools.partial) and (owner := _owner(home)) is not None:
         raise ConfigError(
             f"{where}: {module!r} has {name!r} from {home!r}, a module of {owner}; a config may name what you have "

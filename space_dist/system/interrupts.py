@@ -57,6 +57,7 @@ class StopRequests:
         def keep_ours(number: int, handler: Any) -> Any:
             return signal.getsignal(number) if number in STOP_SIGNALS else replace(number, handler)
 
+        # `ray.init` replaces SIGTERM's handler; what came in these seconds would end the process its way.
         signal.signal = keep_ours  # type: ignore[assignment]
         try:
             yield

@@ -17,4 +17,5 @@ def collect_seldom() -> None:
     """
     gc.set_threshold(_NEW_OBJECTS, *gc.get_threshold()[1:])
     atexit.unregister(gc.freeze)
+    # Frozen objects are not looked through, so that the last collection, as Python ends, finds next to nothing to do.
     atexit.register(gc.freeze)

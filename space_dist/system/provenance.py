@@ -77,6 +77,7 @@ def _digest(folder: Path) -> str:
         raise ConfigError(f"{folder} holds {len(files)} Python files; a package of your own may have {_MAX_SOURCES}")
     digest = hashlib.sha256()
     for file in files:
+        # Path and size before the content: else the same bytes, cut into files otherwise, would have one digest.
         digest.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()[:_DIGITS]
@@ -96,6 +97,7 @@ def git_state() -> dict[str, str]:
         return done.stdout.strip() if done.returncode == 0 else None
 
     commit = git("rev-parse", "HEAD")
+    # Installed into somebody else's repository, the commit would be that one's.
     if commit is None or git("ls-files", "--error-unmatch", __file__) is None:
         return {}
     return {"git_commit": commit, "git_dirty": str(bool(git("status", "--porcelain", "--", "."))).lower()}

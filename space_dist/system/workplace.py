@@ -10,7 +10,9 @@ from pathlib import Path
 from space_dist.errors import ConfigError
 
 RAY_DEFAULTS = {
+    # Ray would report usage to its makers.
     "RAY_USAGE_STATS_ENABLED": "0",
+    # Ray would leave out lines that several workers write alike.
     "RAY_DEDUP_LOGS": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     # Its handler lets ours hear SIGTERM, and has the process killed by SIGABRT 3 s later.

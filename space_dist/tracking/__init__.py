@@ -182,6 +182,7 @@ def follow(
                 last = False
         if last:
             return total
+        # So that looking takes a twentieth of its time at most, however many runs there are.
         until = time.monotonic() + poll_seconds * max(1.0, (looking + mirror.looking_seconds) / _LOOK_SECONDS)
         while (left := until - time.monotonic()) > 0:
             if not mirror.anyone_works(found) if stop is None else stop():
@@ -253,9 +254,11 @@ class _Mirror:
         result = SyncResult(1)
         if target is not None:
             store, experiment = self._store(target[0]), target[1]
+            # One writer at a time: SQLite gives up on a second one after its busy timeout.
             with store.exclusively():
                 _, new, pushed = store.push(snapshot, experiment)
             result = SyncResult(1, int(new), pushed, pages=(store.page(experiment),))
+        # Noted last: what fails on the way is pushed again at the next look.
         self._settled[ledger.folder] = (status, alive)
         return result
 

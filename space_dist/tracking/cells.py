@@ -79,6 +79,7 @@ def curve(done: Sequence[Evaluations], under_way: Sequence[Evaluations]) -> tupl
     if not counted:
         return ()
     steps = functools.reduce(np.union1d, (one.steps for one in counted))
+    # Before a seed's first evaluation the cell has no number of it.
     steps = steps[steps >= max(one.steps[0] for one in counted)]
     if not done:
         steps = steps[steps <= min(one.steps[-1] for one in counted)]
@@ -127,6 +128,7 @@ class CellCurve:
     def continues(self, intent: str) -> bool:
         """Whether these rows begin with those that were noted."""
         count, _, digest = intent.partition(" ")
+        # People can edit tags; no count has so many digits.
         return count.isdecimal() and len(count) < 16 and digest == _digest(self.rows[: int(count)])
 
     def points(self, start: int) -> Iterator[tuple[int, Point]]:

@@ -30,6 +30,7 @@ def describe(grid: Grid, manifest: Manifest, looks: Sequence[Look]) -> tuple[str
     if len(whole) <= MAX_TAG:
         return whole, None
     shown, kept = [*plan, "", *status_lines, "", head], 0
+    # 100: for the sentence that says how many cells are left out.
     room = MAX_TAG - 100 - len("\n".join(shown))
     for row in rows:
         room -= len(row) + 1

@@ -97,6 +97,7 @@ class GridMirror:
             self._manifest, self._manifest_signature = self.grid.manifest(), found
             ledgers = [(run, self.grid.ledger(run)) for run in self._manifest.runs()]
             self._runs = [(run, str(one.status_file), str(Attempts(one).path)) for run, one in ledgers]
+            # Another plan may have other cells, and gets another parent.
             self._looks, self._pending, self._pending_cells, self._unfed, self._parent_id = {}, {}, {}, {}, None
         for run, status, attempts in self._runs:
             known = self._looks.get(run.key)
@@ -168,6 +169,7 @@ class GridMirror:
             part = self._part(manifest, run, parent.key)
             child, above = self._children.get(part.key), self._children.get(self._cell_key(parent.key, run.cell))
             owner = parent_id if above is None else above.run_id
+            # The stamp is the last thing that a push writes: who has it has everything, and MLflow is asked nothing.
             if child is None or (child.stamp, child.ending, child.parent) != (part.stamp, part.ending, owner):
                 try:
                     run_id, new, pushed = store.push(
@@ -204,6 +206,7 @@ class GridMirror:
             child = self._children[record.key] = Child(run_id, record.stamp, record.mlflow_status, self._parent_id)
         self.failed.pop(folder, None)
         keys = [self._run_key(key, Run(cell, seed)) for seed in manifest.seeds]
+        # Their old parent is in MLflow's trash.
         strays = {one: found for one in keys if (found := self._children.get(one)) and found.parent != child.run_id}
         store.adopt([stray.run_id for stray in strays.values()], child.run_id)
         for one, stray in strays.items():
@@ -334,6 +337,7 @@ class GridMirror:
         def write(folder: Path) -> None:
             from space_dist import report  # here: it imports Matplotlib, which takes long
 
+            # Before it is made: one that cannot be made is not tried at every look.
             self._reported = time.monotonic()
             try:
                 report.build_grid_report(self.grid, folder)
@@ -365,6 +369,7 @@ def _of_cell(manifest: Manifest, cell: Cell, grid_key: str) -> dict[str, str]:
 
 def _place(cell: Cell) -> str:
     """A cell's folder among those of a sink: its label, as far as that is plain."""
+    # A label is people's own words: in a path, `..` or a slash would lead elsewhere.
     plain = re.sub(r"[^A-Za-z0-9=_,. -]", "_", cell.label).strip(". ")
     return plain if plain and plain == cell.label else f"{plain} {cell.id}".strip()
 

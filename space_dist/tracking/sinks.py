@@ -81,6 +81,7 @@ def read_synced(folder: Path) -> Synced:
     try:
         data: Any = json.loads(read_file(folder / _STATE, _MAX_STATE))
         found = Synced(**data)
+    # Nothing is known then, and everything is written again: pushing twice changes nothing.
     except (OSError, ValueError, TypeError, RecursionError):
         return Synced()
     numbers = all(type(value) is int and value >= 0 for value in (found.rows, found.size))

@@ -116,6 +116,7 @@ class Store:
         self._artifact_location: str | None = None  # the server's choice
         if uri.startswith("sqlite:"):
             database = _database(uri)
+            # MLflow's own choice is `./mlruns`, wherever the process happens to stand.
             self._artifact_location = (database.parent / "mlartifacts").as_uri()
             self._client = _open_database(uri, database)
         else:
@@ -149,6 +150,7 @@ class Store:
             self._push_params(run, record.params)
             pushed = self._push_rows(run, record)
             self._push_tags(run, tags)
+            # After rows and tags: a run that looks finished has all its numbers.
             self._push_ending(run, record.mlflow_status, record.ended_at)
             if isinstance(record, Snapshot) and record.started:
                 self._push_artifacts(run, record)
@@ -186,6 +188,7 @@ class Store:
                         str(run.info.run_id), tags.get(STAMP_TAG, ""), str(run.info.status), tags.get(PARENT_TAG)
                     )
                     key = tags.get(RUN_TAG, "")
+                    # Two may have been made by pushers that did not see each other: all take the same one.
                     found[key] = min(child, found.get(key, child), key=lambda one: one.run_id)
                 page = runs.token
                 if not page:
@@ -197,6 +200,7 @@ class Store:
             found = self._client.search_runs([self._experiment_id(experiment)], f"tags.`{RUN_TAG}` = '{parent.key}'")
             for run in found:
                 if run.data.tags.get(PLAN_TAG) != parent.plan:
+                    # MLflow changes no parameter: another plan needs another run.
                     self._client.delete_run(run.info.run_id)
             return min(
                 (str(run.info.run_id) for run in found if run.data.tags.get(PLAN_TAG) == parent.plan), default=None
@@ -305,6 +309,7 @@ class Store:
         """Numbers of now that are not there: MLflow shows the latest."""
         from mlflow.entities import Metric
 
+        # The time of now and not of a run: MLflow takes the point of the latest time for the latest value.
         now = round(time.time() * 1000)
         changed = [Metric(key, value, now, 0) for key, value in numbers.items() if run.data.metrics.get(key) != value]
         for start in range(0, len(changed), _MAX_METRICS):
@@ -399,9 +404,11 @@ def _open_database(uri: str, database: Path) -> MlflowClient:
     with _locked(database.parent / f".{database.name}.lock"):
         # MLflow would try for minutes to open a file that it can never write to.
         with contextlib.closing(sqlite3.connect(database, timeout=_DATABASE_WAIT_SECONDS)) as connection:
+            # Takes the write lock, which opening a file does not: a read-only one is told here.
             connection.execute("BEGIN IMMEDIATE")
             connection.rollback()
         client = _new_client(uri)
+        # The first question creates the tables.
         client.get_experiment_by_name("Default")
     return client
 

@@ -41,6 +41,7 @@ class TensorBoard:
         folder.mkdir(parents=True, exist_ok=True)
         rows = there.rows
         with os.fdopen(open_own(file, os.O_RDWR | os.O_CREAT), "r+b") as stream:
+            # Whatever a pusher that died has written behind what it noted.
             stream.truncate(there.size)
             stream.seek(there.size)
             writer = RecordWriter(stream)
@@ -50,6 +51,7 @@ class TensorBoard:
                 rows = complete
                 writer.write(_event(point).SerializeToString())
             stream.flush()
+            # On disk before it is noted: a note of more than is there would leave a gap for good.
             os.fsync(stream.fileno())
             size = stream.tell()
         now = Synced(rows, record.intent, "", size)

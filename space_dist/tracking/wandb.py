@@ -42,6 +42,7 @@ class WeightsAndBiases:
         if read_synced(folder) == now:
             return
         folder.parent.mkdir(parents=True, exist_ok=True)
+        # Written beside and renamed: who syncs meanwhile finds whole runs only.
         with tempfile.TemporaryDirectory(prefix=".new", dir=folder.parent) as new:
             self._write(record, Path(new))
             for old in folder.glob("offline-run-*") if folder.is_dir() else ():
@@ -55,6 +56,7 @@ class WeightsAndBiases:
         import wandb
 
         settings = wandb.Settings(
+            # Nothing is sent anywhere, and nothing of this machine or its repository is recorded.
             mode="offline", console="off", silent=True, disable_git=True, disable_code=True, save_code=False,
             x_disable_stats=True, x_disable_meta=True, x_disable_machine_info=True,
         )  # fmt: skip
@@ -67,6 +69,7 @@ class WeightsAndBiases:
         except wandb.Error as error:
             raise OSError(f"Weights & Biases writes no run: {error}") from error
         try:
+            # W&B's own step counts calls of `log`; curves are over environment steps.
             run.define_metric("steps")
             run.define_metric("*", step_metric="steps")
             rows: dict[tuple[int, int], dict[str, float]] = {}

@@ -49,6 +49,12 @@ def original(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     return config, folder / "run", results(folder / "reference"), read(ledger, spec_of(config))
 
 
+@pytest.fixture
+def copy(original: tuple[Any, Path, Any, Any], tmp_path: Path) -> Path:
+    """The run once more, to be damaged."""
+    return Path(shutil.copytree(original[1], tmp_path / "run"))
+
+
 def read(ledger: Ledger, spec: EnvironmentSpec) -> dict[str, Any]:
     """What `evaluate`, `report` and `sync` take from a run; a refusal is the sentence alone."""
 
@@ -105,13 +111,10 @@ def resumes_to_the_same_bytes_or_is_refused(config: configs.RunConfig, folder: P
     return True
 
 
-def test_every_file_cut_short_and_changed(original: tuple[Any, Path, Any, Any], tmp_path: Path) -> None:
+def test_every_file_cut_short_and_changed(original: tuple[Any, Path, Any, Any], copy: Path) -> None:
     """What a resumption reads is cut at every length in the interrupted run, the rest in the one that is done."""
-    config, folder, _, before = original
-    spec = spec_of(config)
-    copy, rng = tmp_path / "run", random.Random(0)
-    shutil.copytree(folder, copy)
-    ledger = Ledger(copy)
+    config, _, _, before = original
+    spec, ledger, rng = spec_of(config), Ledger(copy), random.Random(0)
     done = ledger.status().state == "done"
     cut = changed = 0
     with RunWriter(ledger) as writer:
@@ -197,12 +200,8 @@ def test_two_damages_at_once(original: tuple[Any, Path, Any, Any], tmp_path: Pat
         resumes_to_the_same_bytes_or_is_refused(config, copy, right)
 
 
-def test_emptied_checkpoints_are_not_started_over_in_silence(
-    original: tuple[Any, Path, Any, Any], tmp_path: Path
-) -> None:
-    config, folder, _, _ = original
-    copy = tmp_path / "run"
-    shutil.copytree(folder, copy)
+def test_emptied_checkpoints_are_not_started_over_in_silence(original: tuple[Any, Path, Any, Any], copy: Path) -> None:
+    config = original[0]
     for path in (copy / "checkpoints").iterdir():
         path.unlink()
     before = {path: path.read_bytes() for path in copy.rglob("*.jsonl")}
@@ -214,12 +213,7 @@ def test_emptied_checkpoints_are_not_started_over_in_silence(
     assert {path: path.read_bytes() for path in copy.rglob("*.jsonl")} == before
 
 
-def test_after_a_fallback_the_status_names_the_checkpoint_that_is_used(
-    original: tuple[Any, Path, Any, Any], tmp_path: Path
-) -> None:
-    _, folder, _, _ = original
-    copy = tmp_path / "run"
-    shutil.copytree(folder, copy)
+def test_after_a_fallback_the_status_names_the_checkpoint_that_is_used(copy: Path) -> None:
     newest, older = Ledger(copy).checkpoint_files()
     newest.write_bytes(newest.read_bytes()[:-1])
     with RunWriter(Ledger(copy)) as writer:
@@ -233,11 +227,9 @@ def test_after_a_fallback_the_status_names_the_checkpoint_that_is_used(
 
 
 def test_a_checkpoint_that_cannot_be_read_now_is_not_thrown_away(
-    original: tuple[Any, Path, Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    original: tuple[Any, Path, Any, Any], copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, folder, _, _ = original
-    copy = tmp_path / "run"
-    shutil.copytree(folder, copy)
+    config = original[0]
     (copy / "status.json").unlink()  # a run that is done is not restored
     checkpoints = Ledger(copy).checkpoint_files()
 

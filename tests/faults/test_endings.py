@@ -127,7 +127,7 @@ def test_what_is_stood_in_for_is_put_back(tmp_path: Path) -> None:
     assert os._exit is before
 
 
-LINKED = ("log.txt", "lock.json")  # the others: tests/test_ledger.py
+LINKED = ("log.txt", "lock.json")  # the others: tests/test_owner.py
 
 
 @pytest.mark.parametrize("name", LINKED)

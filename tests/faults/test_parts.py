@@ -15,7 +15,6 @@ import pytest
 from space_dist import config as configs
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
-from space_dist.system.workplace import private_ray
 from tests.faults.test_every_write import short
 from tests.test_learners import results
 
@@ -26,14 +25,6 @@ QUICK = {"late_seconds": 3.0, "late_factor": 1.0, "first_answer_seconds": 60.0, 
 
 def with_resources(config: configs.RunConfig, **resources: Any) -> configs.RunConfig:
     return config.model_copy(update={"resources": config.resources.model_copy(update={**QUICK, **resources})})
-
-
-@pytest.fixture(scope="module")
-def cluster_class() -> Any:
-    private_ray()
-    from space_dist.run.ray_cluster import RayCluster
-
-    return RayCluster
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,184 @@
+"""`ContextVecEnv` alone, and what it and the callback refuse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from sb3_contrib import ARS, MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecFrameStack
+
+from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.instances import InstanceSet
+from space_dist.sb3 import ContextVecEnv, CurriculumCallback
+from tests.faulty_env import Honest
+from tests.test_sb3 import DISCRETE, LINE, SLOTS, TARGETS, line_env, made, ppo, remembered
+
+# ---- the environment ----
+
+
+class Lesson(Honest):
+    """With something of its own to tell."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, {**info, "own": 1}
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        return np.array([True, False, True])
+
+
+CONTEXTS = np.array([[0.2, 0.1], [0.3, -0.2], [0.4, 0.3]])
+
+
+def test_without_a_callback_it_walks_over_its_instances() -> None:
+    env = ContextVecEnv(Lesson, CONTEXTS)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    instances: list[int] = []
+
+    def note(locals_: dict[str, Any], _: dict[str, Any]) -> None:
+        if locals_["done"]:
+            info = locals_["info"]
+            instances.append(info["instance"])
+            assert info["context"].tolist() == CONTEXTS[info["instance"]].tolist()
+            assert {"own", "is_success", "terminal_observation", "TimeLimit.truncated"} <= info.keys()
+
+    played = [evaluate_policy(model, env, n_eval_episodes=3, callback=note, return_episode_rewards=True, warn=True)
+              for _ in range(2)]  # fmt: skip
+    assert instances == [0, 1, 2] * 2
+    assert played[0] == played[1]
+    single = Lesson()
+    for number, (reward, length) in enumerate(zip(*played[0], strict=True)):
+        assert length >= 1
+        assert np.isfinite(reward)
+        assert single.context_space.contains(CONTEXTS[number].astype(single.context_space.dtype))
+
+
+def test_it_answers_as_sb3s_own_does() -> None:
+    """Step by step, beside DummyVecEnv's environments that are reset by hand."""
+    env = ContextVecEnv(Lesson, CONTEXTS, 2, context_visible=False, seed=9)
+    other = make_vec_env(Lesson, 2)
+    assert env.observation_space == other.observation_space
+    assert env.action_space == other.action_space
+    observations = env.reset()
+    assert observations.shape == other.reset().shape
+    random = np.random.default_rng(0)
+    finished = 0
+    for _ in range(60):
+        observations, rewards, dones, infos = env.step(random.integers(3, size=2))
+        assert (observations.dtype, rewards.dtype, dones.dtype) == (np.float32, np.float32, np.bool_)
+        for slot in np.flatnonzero(dones):
+            finished += 1
+            assert infos[slot]["terminal_observation"].shape == observations[slot].shape
+            assert infos[slot]["episode"]["l"] >= 1
+    assert finished > 4
+    assert env.get_attr("context_names") == [("gain", "drift")] * 2
+    assert np.array(env.env_method("action_masks", indices=[1])).tolist() == [[True, False, True]]
+    assert env.env_is_wrapped(Monitor) == [True, True]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
+    env.set_attr("own", 3, indices=0)
+    assert env.get_attr("own", indices=0) == [3]
+    assert not env.has_attr("nothing")
+    env.close()
+
+
+def test_it_walks_on_for_as_long_as_it_is_stepped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("space_dist.sb3.vec_env._FREE_STEPS", 5)
+    env = line_env(n_envs=2)
+    met = []
+    for _ in range(40):  # before any reset, and beyond what is remembered at once
+        _, _, _, infos = env.step(np.zeros((2, 1), dtype=np.float32))
+        met += [info["instance"] for info in infos if "instance" in info]
+    assert met == [number % len(TARGETS) for number in range(len(met))]
+    assert len(met) == 10
+
+
+def test_masked_policies_learn() -> None:
+    env = ContextVecEnv(Lesson, CONTEXTS, 2)
+    model = MaskablePPO("MlpPolicy", env, n_steps=16, batch_size=16, seed=0, device="cpu")
+    callback = CurriculumCallback("plr")
+    model.learn(96, callback=callback)
+    assert callback.selection.version == 3
+    assert (model.rollout_buffer.actions != 1).all()
+
+
+def test_probe_episodes_are_counted() -> None:
+    env = ContextVecEnv(DISCRETE, TARGETS, SLOTS)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=20, n_epochs=1, seed=0, device="cpu")
+    callback = CurriculumCallback("learnability", top=2, every=2, episodes=2)
+    seen: list[Mapping[str, Any]] = []
+
+    class Note(BaseCallback):
+        def _on_step(self) -> bool:
+            if not seen or seen[-1] is not callback.numbers:
+                seen.append(callback.numbers)
+            return True
+
+    model.learn(1000, callback=[callback, Note()])
+    probes = sum(numbers.get("probe_steps", 0) for numbers in seen)
+    assert probes > 0
+    assert probes % (2 * len(TARGETS) * 8) == 0  # whole episodes, of eight steps, two of every instance
+    rounds = remembered(model).round
+    assert model.num_timesteps == rounds * 10 * SLOTS + probes
+    assert model.num_timesteps <= 1000 + 10 * SLOTS
+
+
+# ---- what is refused ----
+
+
+@pytest.mark.parametrize(
+    ("attempt", "sentence"),
+    [
+        (lambda: CurriculumCallback("spacey"), r"CurriculumCallback: curriculum\.kind: 'spacey' is not known; did you "
+                                               r"mean 'space'\?"),
+        (lambda: CurriculumCallback("space", kapa=2), r"curriculum\.kapa: unknown key; did you mean 'kappa'\?"),
+        (lambda: CurriculumCallback("space", eta=-1.0), r"curriculum\.eta: -1\.0: .*greater than 0"),
+        (lambda: CurriculumCallback("space", passes=0.0), "passes: 0.0: .*greater than 0"),
+        (lambda: CurriculumCallback().selection, r"before learn\(\) has begun"),
+        (lambda: ContextVecEnv(Honest(), CONTEXTS), "env is a Honest; give the class"),
+        (lambda: ContextVecEnv(Honest, CONTEXTS, 0), "n_envs must be a whole number of at least 1, not 0"),
+        (lambda: ContextVecEnv(Honest, CONTEXTS[:, 0]), r"shape \(3,\); it needs one row an instance and 2 columns, "
+                                                        "one for each of gain, drift"),
+        (lambda: ContextVecEnv(Honest, [["a", "b"]]), "instances is a list; give a CSV file"),
+        (lambda: ContextVecEnv(Honest, CONTEXTS + 1.0), r"instance 0 has gain = 1\.2, outside .* \[0\.1, 0\.5\]"),
+        (lambda: ContextVecEnv(Honest, "nowhere.csv"), "nowhere.csv: there is no such file"),
+        (lambda: ContextVecEnv(LINE, InstanceSet(np.array([0]), np.array([[0.1]]), ("goal",))),
+         "features are goal, the environment's are target"),
+        (lambda: ContextVecEnv("CartPole-v1", [0.5]), "CartPole-v1.*no `context_space`"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> None:
+    with pytest.raises(SpaceDistError, match=sentence):
+        attempt()
+
+
+@pytest.mark.parametrize(
+    ("model", "callback", "sentence"),
+    [
+        (lambda: PPO("MlpPolicy", make_vec_env(Honest, 2), n_steps=8, batch_size=8), {}, "a DummyVecEnv, which"),
+        (lambda: PPO("MlpPolicy", VecFrameStack(line_env(), 2), n_steps=8, batch_size=8), {}, "VecFrameStack around"),
+        (lambda: ARS("MlpPolicy", line_env()), {}, "ARS has no value function"),
+        (lambda: made("dqn"), {"kind": "plr"}, "plr scores episodes by their advantages, which DQN does not compute"),
+        (lambda: MaskablePPO("MlpPolicy", line_env(DISCRETE)), {"kind": "learnability", "top": 2},
+         "MaskablePPO could not"),
+        (lambda: ppo(line_env()), {"kind": "learnability"}, r"curriculum\.top: 20 is too many"),
+        (lambda: ppo(ContextVecEnv(LINE, TARGETS, SLOTS, context_visible=False)), {}, "context_visible=True"),
+        (lambda: ppo(line_env(), policy_kwargs={"activation_fn": torch.nn.ELU}), {"kind": "vds"},
+         "knows Tanh and ReLU, not ELU"),
+        (lambda: ppo(line_env()), {"aggregate": "population"}, "trains several policies"),
+        (lambda: ppo(line_env()), {"kind": "manual", "column": "difficulty"}, "without a column 'difficulty'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_given_is_refused(model: Callable[[], Any], callback: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        model().learn(16, callback=CurriculumCallback(**callback))

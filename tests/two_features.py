@@ -1,0 +1,17 @@
+"""Instances with a context of two features, for tests of curricula, which know no environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from space_dist.instances import ContextBounds, InstanceSet
+
+BOUNDS = ContextBounds(("a", "b"), np.array([0.0, -10.0]), np.array([2.0, 10.0]))
+
+
+def scattered(n: int, *, first_id: int = 0, **columns: Any) -> InstanceSet:
+    """n instances that vary in every direction, so that their covariance is not singular."""
+    contexts = np.random.default_rng(3).uniform(BOUNDS.low, BOUNDS.high, size=(n, 2))
+    return InstanceSet(np.arange(first_id, first_id + n), contexts, BOUNDS.names, columns)
