@@ -203,6 +203,10 @@ def test_tracking_uris_that_could_not_be_mirrored_to_are_refused_and_no_password
     assert "sqlite:////absolute/path/mlflow.db" in text
     assert "secret" not in str(caught.value)
     assert ("MLFLOW_TRACKING_PASSWORD" in text) == ("http" in uri and "secret" in uri and "[" not in uri)
+    for override in (f"tracking.uri={uri!r}", f"tracking.url={uri}", f"tracking.uri=[{uri}"):
+        with pytest.raises(ConfigError) as caught:
+            load(SPACE, [override])
+        assert "secret" not in str(caught.value), override
 
 
 def test_learners_say_what_they_can_do() -> None:

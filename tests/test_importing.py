@@ -138,7 +138,8 @@ LIBRARIES = {
     "numpy:load": "numpy", "torch.hub:load": "torch", "ray:init": "ray", "six.moves:reload_module": "six",
     "jinja2.sandbox:modifies_known_mutable": "jinja2", "virtualenv:cli_run": "virtualenv", "pip:main": "pip",
     "setuptools:setup": "setuptools", "gymnasium:make": "gymnasium", "stable_baselines3:PPO": "stable",
-    "space_dist.cli:main": "space_dist itself",
+    "space_dist.cli:main": "space_dist itself", "tensorboard.program:TensorBoard": "tensorboard",
+    "wandb:init": "wandb", "pytest:main": "pytest", "mkdocs.commands.build:build": "mkdocs",
 }  # fmt: skip
 
 

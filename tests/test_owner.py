@@ -260,6 +260,27 @@ def test_nothing_is_written_through_a_link(ledger: Ledger, tmp_path: Path, name:
     assert target.read_bytes() == precious[0]
 
 
+@pytest.mark.parametrize("name", ["checkpoints", "replay"])
+def test_nothing_is_written_or_removed_below_a_link(tmp_path: Path, name: str) -> None:
+    """What looks like ours in the folder that it leads to would be taken for checkpoints too many, or left over."""
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    for file in ("round-000000001.npz", "measured.npz", ".measured.tmp"):
+        (precious / file).write_text("precious")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).symlink_to(precious)
+    with pytest.raises(LedgerError, match=rf"{name} is a link"), RunWriter(Ledger(tmp_path / "run")):
+        pass
+    (tmp_path / "run" / name).unlink()
+    with RunWriter(Ledger(tmp_path / "run")) as writer:
+        if name == "replay":
+            (tmp_path / "run" / name).symlink_to(precious)
+            with pytest.raises(LedgerError, match="replay is a link"):
+                writer.write_segment(0, 1, {"w": np.zeros(1)})
+    assert {file.read_text() for file in precious.iterdir()} == {"precious"}
+    assert len([*precious.iterdir()]) == 3
+
+
 def test_the_same_process_cannot_own_a_run_twice(ledger: Ledger) -> None:
     with RunWriter(ledger):
         refused(ledger)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict, deque
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -26,12 +27,16 @@ from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.learner import make_learner
 from space_dist.learner.normaliser import _discounted
+from space_dist.ledger import METRICS, Ledger
 from space_dist.rollout import Rollout, Setup, Shard, Stage, Worker, collect, collecting
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
+from space_dist.run.launch import launch
 from space_dist.seeding import Purpose, generator
+from space_dist.system.interrupts import StopRequests
 from tests.test_learner import Ignore
+from tests.test_learners import config_for, learner_section
 from tests.test_rollout import Countdown, bits, falling, setup_for, uniform, weights_for
-from tests.tiny_env import Line
+from tests.tiny_env import HORIZON, Line
 
 POINTMASS, LINE = "space_dist/PointMass-v0", "tests.tiny_env:make"
 LENGTH, ROUNDS = 7, 24  # of PointMass's 100 steps
@@ -163,6 +168,22 @@ def test_shards_in_any_company_go_on_with_the_same_bits() -> None:
             ):
                 before[one] = shard.unfinished
                 assert bits(shard) == expected[one, at]
+
+
+@pytest.mark.parametrize("length", [3, 12])  # of a slot in a round; an episode has 8 steps
+@pytest.mark.parametrize("engine", ["single", "population"])
+def test_a_run_logs_whole_episodes_and_no_stub(length: int, engine: str, tmp_path: Path) -> None:
+    slots, rounds = 8, 10
+    steps = length * slots
+    config = config_for(
+        tmp_path, learner_section("ppo", n_steps=steps), engine=engine, budget={"steps": rounds * steps},
+        evaluation={"every_steps": 10_000}, curriculum={"kind": "round_robin"},
+    )  # fmt: skip
+    launch(config, tmp_path / "run", resume=False, stop=StopRequests())
+    rows = [row for row in Ledger(tmp_path / "run").rows(METRICS) if row["kind"] == "iteration"]
+    assert {row["rollout"]["length"] for row in rows if row["episodes"]} == {HORIZON}
+    assert sum(row["episodes"] for row in rows) == slots * (rounds * length // HORIZON)
+    assert rows[-1]["steps"] == rounds * steps
 
 
 # ---- environments that break the contract ----

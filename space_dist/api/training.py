@@ -156,7 +156,7 @@ def as_config(
     else:
         for override in overrides:
             configs.apply_override(data, override)
-            origins[override.partition("=")[0].strip()] = f"--set {override}"
+            origins[override.partition("=")[0].strip()] = configs.told(override)
     for key, given in (("seed", seed), ("resources.workers", workers)):
         if given is not None:
             configs.put(data, key, _without_numpy(given), source)

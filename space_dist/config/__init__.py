@@ -54,6 +54,7 @@ from space_dist.config.reading import (
     parse,
     put,
     read,
+    told,
 )
 from space_dist.config.run import RunConfig
 from space_dist.config.sections import (
@@ -132,5 +133,6 @@ __all__ = [
     "schema",
     "shipped_files",
     "to_yaml",
+    "told",
     "with_what_it_names",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from space_dist.config.shipped import PREFIX, located
 from space_dist.errors import ConfigError
 
 _M = TypeVar("_M", bound=BaseModel)
+_CREDENTIALS = re.compile(r"//[^/\s]*@")
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
@@ -28,7 +30,7 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
         apply_override(data, override)
     if seed is not None:
         data["seed"] = seed
-    origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}
+    origins = {override.partition("=")[0].strip(): told(override) for override in overrides}
     return parse(data, str(path), origins)
 
 
@@ -98,12 +100,17 @@ def apply_override(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts) or not override.isprintable():
-        raise ConfigError(f"--set {override!r}: write KEY=VALUE, like --set budget.steps=20000")
-    value = parse_yaml(text, f"--set {override}")
+        raise ConfigError(f"{told(repr(override))}: write KEY=VALUE, like --set budget.steps=20000")
+    value = parse_yaml(text, told(override))
     # Who types a path at a prompt means it from where they stand, and not from the config's folder.
     if parts[0] in ("instances", "init_from"):
         value = _from_here(value)
-    put(data, ".".join(parts), value, f"--set {override}")
+    put(data, ".".join(parts), value, told(override))
+
+
+def told(override: str) -> str:
+    """An override as sentences name it: without the credentials of a URI."""
+    return f"--set {_CREDENTIALS.sub('//...@', override)}"
 
 
 def _from_here(value: Any) -> Any:

@@ -30,7 +30,7 @@ from space_dist.ledger.checkpoint import (
 from space_dist.ledger.folder import Ledger, State, Status, read_whole
 from space_dist.ledger.lock import Lock
 from space_dist.ledger.rows import ROW_FILES, Row, encode_row
-from space_dist.system.files import TEMPORARIES, appending, atomic_write, read_file, why_not_own
+from space_dist.system.files import TEMPORARIES, appending, atomic_write, own_folder, read_file, why_not_own
 
 log = logging.getLogger("space_dist")
 KEPT_CHECKPOINTS = 2  # one more than is needed: the newest may turn out to be damaged
@@ -56,7 +56,9 @@ class RunWriter:
             self.ledger.folder.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
             try:
-                self.ledger.checkpoints.mkdir(exist_ok=True)
+                own_folder(self.ledger.checkpoints)
+                if self.ledger.replay.exists():
+                    own_folder(self.ledger.replay)
                 for folder in (self.ledger.folder, self.ledger.checkpoints, self.ledger.replay):
                     for left_behind in folder.glob(TEMPORARIES):  # by a process that was killed while it wrote
                         left_behind.unlink()
@@ -266,7 +268,7 @@ class RunWriter:
         content = encode_arrays(arrays)
         segment = Segment(first, count, hashlib.sha256(content).hexdigest())
         with _clear_errors(self.ledger.folder), self._lock.held():
-            self.ledger.replay.mkdir(exist_ok=True)
+            own_folder(self.ledger.replay)
             atomic_write(self._segment_path(segment), content)
         return segment
 

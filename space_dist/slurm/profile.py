@@ -266,7 +266,7 @@ def load_profile(path: Path | None, overrides: Sequence[str] = ()) -> Profile:
     data: dict[str, Any] = {} if path is None else configs.read_yaml(configs.located(path))
     for override in overrides:
         configs.apply_override(data, override)
-    origins = {override.partition("=")[0].strip(): f"--set {override}" for override in overrides}
+    origins = {override.partition("=")[0].strip(): configs.told(override) for override in overrides}
     return configs.check(Profile, data, str(path or "the default profile"), origins)
 
 

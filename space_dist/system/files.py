@@ -44,6 +44,13 @@ def open_own(path: Path, flags: int, mode: int = 0o666) -> int:
     return descriptor
 
 
+def own_folder(path: Path) -> None:
+    """Make a folder of ours, unless it is there. Raises OSError: ELOOP for a link, which leads into somebody else's."""
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    path.mkdir(exist_ok=True)
+
+
 def appending(path: Path) -> io.BufferedWriter:
     """The file, made if need be, for writing at its end. Raises OSError as `open_own`."""
     return os.fdopen(open_own(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab")

@@ -24,6 +24,7 @@ PYTHON = (sys.executable, "-P")
 
 _OURS = "space_dist"
 _COMES_WITH_PYTHON = ("pip", "setuptools", "wheel")
+_ENVIRONMENTS = "pybullet-envs-gymnasium"  # a library that we test with, of environments alone
 _REQUIREMENT = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^\]]*)\])?")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
@@ -123,8 +124,12 @@ def _providers() -> dict[str, list[str]]:
 
 @functools.cache
 def _needed() -> frozenset[str]:
-    """The distributions without which this package does not run, and theirs, and what every environment has."""
-    asked = [*((name, "") for name in _COMES_WITH_PYTHON), ("space-dist", "")]
+    """The distributions that this package needs, its extras' included, and theirs, and what every environment has."""
+    try:
+        extras = importlib.metadata.metadata("space-dist").get_all("Provides-Extra") or []
+    except importlib.metadata.PackageNotFoundError:
+        extras = []
+    asked = [*((name, "") for name in _COMES_WITH_PYTHON), *(("space-dist", extra) for extra in ("", *extras))]
     seen: set[tuple[str, str]] = set()
     while asked:
         name, extra = asked.pop()
@@ -139,7 +144,7 @@ def _needed() -> frozenset[str]:
             found, wanted = _REQUIREMENT.match(text), _EXTRA.search(text)
             if found is not None and (wanted is None or wanted.group(1) == extra):
                 asked += [(_normal(found[1]), one.strip()) for one in ("", *(found[2] or "").split(","))]
-    return frozenset(name for name, _ in seen)
+    return frozenset(name for name, _ in seen) - {_ENVIRONMENTS}
 
 
 def _normal(name: str) -> str:
