@@ -51,6 +51,7 @@ class ActingPolicy:
         if deterministic:
             actions = head.best(outputs)
         else:
+            # The last step there is: behind every warm-up and exploration schedule.
             noise = Noise.draw(head, self.spec.action_space, self._random, (1, rows(batch)))
             actions = head.sampled(outputs, noise, 0, np.full(rows(batch), np.iinfo(np.int64).max))
         executed = head.executed(actions)

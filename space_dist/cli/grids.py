@@ -323,6 +323,7 @@ def grid_work(
     for ended in failed:
         warn(f"space-dist: {ended.cause.in_words if ended.cause else ''}: {ended.detail}")
     resumable = (Cause.STOPPED, Cause.PREEMPTED, Cause.TIMEOUT)
+    # The worst one counts: 75, which asks for another start, must not hide a failure.
     codes = {75 if one.cause in resumable else 2 if one.cause is Cause.CONFIG_ERROR else 1 for one in failed}
     if codes:
         raise typer.Exit(min(codes, key=[1, 2, 75].index))

@@ -220,6 +220,7 @@ def _grid(path: Path, root: Path | None) -> Grid:
 def print_report(result: Report, to: Console) -> None:
     """Show a report's table, its caveats, and where the files are."""
     # One block per configuration where the terminal is too narrow for a row of so many columns.
+    # Rich takes brackets for markup: those of names and intervals are to be seen.
     wide = to.width >= _REPORT_WIDTH
     if wide:
         table = Table()

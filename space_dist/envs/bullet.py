@@ -230,6 +230,7 @@ class BatchedBullet(Generic[Episode]):
             self._worlds[place] = self._make_world()
         self._vacate(place)
         world = self._worlds[place]
+        # Before the first, too: Bullet keeps contact points and the order of overlapping pairs (docs/environments.md).
         world.rewind()
         self._episodes[slot], observation = world.begin(self._contexts[slot], int(self._seeds[slot]))
         if place == slot % self._n_worlds:

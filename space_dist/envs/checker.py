@@ -350,6 +350,7 @@ class _Check:
     def _draw(self) -> FloatArray:
         drawn = distribution_of(self._env_id, self._kwargs).draw(generator(0, Purpose.INSTANCES), N_CONTEXTS)
         if self._drawn:
+            # Both ends of the bounds as well, which draws hardly ever come near.
             drawn[-2:] = self._bounds.low, self._bounds.high
         return drawn
 

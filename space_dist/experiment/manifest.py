@@ -210,6 +210,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
         for point in grid.points():
             if (len(cells) + 1) * n_runs > MAX_RUNS:
                 raise ConfigError(f"more than {MAX_RUNS:,} runs; a grid may have that many")
+            # Copies, here and below: cells that shared a dict would overwrite each other's values.
             data = json.loads(json.dumps(bases[point.get("extends", grid.extends[0])]))
             for key, value in (*grid.set.items(), *point.items()):
                 if key == "extends":
@@ -434,6 +435,7 @@ class Grid:
         try:
             self.instances.mkdir(parents=True, exist_ok=True)
             for name, content in files.items():
+                # Named by content: what is there is the same.
                 if not (self.instances / name).exists():
                     atomic_write(self.instances / name, content)
             atomic_write(self.manifest_file, manifest.to_json())

@@ -83,6 +83,7 @@ def escaped(text: str) -> str:
     text = re.sub(r"([\\`*<>|&])", r"\\\1", " ".join(text.split()))
     text = re.sub(r"\](?=[(\[:])", r"\\]", text)  # intervals in brackets stay readable
     text = re.sub(r"(?<![^\W_])_|_(?![^\W_])", r"\\_", text)
+    # GitHub makes a link of any bare address.
     return text.replace("~~", r"\~\~").replace("://", r":\//")
 
 

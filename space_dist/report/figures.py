@@ -131,6 +131,7 @@ def draw_heat_map(found: HeatMap, low: float, high: float) -> Figure:
     figure = _figure(min(16.0, 2.8 + 1.25 * n_columns), min(16.0, 1.8 + 0.72 * n_rows))
     axes = figure.subplots()
     colours = colormaps["cividis"].with_extremes(bad="#EEEEEE")
+    # Where all values are one, the scale still needs a width.
     image = axes.imshow(found.means, cmap=colours, vmin=low, vmax=max(high, low + 1e-9), aspect="auto")
     across, down = ([_plain(textwrap.shorten(value, 24, placeholder="…")) for value in values]
                     for values in (found.columns, found.rows))  # fmt: skip
@@ -343,6 +344,7 @@ def _draw_set_sizes(axes: Axes, configuration: Configuration, label: str, style:
     if not curves:
         return
     for steps, sizes in curves:
+        # Matplotlib leaves labels that begin with an underscore out of legends.
         axes.plot(steps, sizes, drawstyle="steps-post", linewidth=0.7, alpha=0.45, label=f"_{label}", **style)
     last = min(steps[-1] for steps, _ in curves)
     grid = np.unique(np.concatenate([steps[steps <= last] for steps, _ in curves]))

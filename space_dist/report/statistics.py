@@ -202,6 +202,7 @@ def _least_probability(found: float, n: int, m: int) -> float:
         variance = p * (1.0 - p) * (1.0 + size * ((1.0 - p) / (2.0 - p) + p / (1.0 + p))) / (n * m)
         return found - p - t * float(np.sqrt(variance))
 
+    # At exactly 1 the variance is 0, and so is the excess: the root found would be that end.
     return float(optimize.brentq(excess, 0.0, min(found, 1.0 - 1e-12)))
 
 

@@ -86,6 +86,7 @@ def _normaliser(config: RunConfig, spec: EnvironmentSpec, ledger: Ledger, learne
     env = ContextVecEnv(
         config.env.id, train, context_visible=config.env.context_visible, env_kwargs=config.env.kwargs
     )  # fmt: skip
+    # SB3 adds `epsilon` below the root, our scales nothing.
     made = VecNormalize(
         env, training=False, norm_obs=settings.normalize_observations, norm_reward=settings.normalize_rewards,
         clip_obs=OBSERVATION_CLIP, gamma=settings.gamma, epsilon=0.0,

@@ -235,11 +235,13 @@ class ContextVecEnv(VecEnv):
         self.time = at + 1
         put(self._current, slice(None), step.observations)
         self._start(ended)
+        # As SB3's DummyVecEnv keeps them.
         return take(self._current, slice(None)), step.rewards.astype(np.float32), dones, infos
 
     def _infos(self, truncated: NDArray[np.bool_]) -> list[dict[str, Any]]:
         env = unwrapped(self._batched)
         given: Sequence[Mapping[str, Any]] = env.infos if isinstance(env, BatchedSingles) else [{}] * self.num_envs
+        # SB3 bootstraps by this key, on-policy as off-policy.
         return [{**info, "TimeLimit.truncated": bool(cut)} for info, cut in zip(given, truncated, strict=True)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
