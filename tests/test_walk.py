@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from sb3_contrib import TRPO
@@ -29,6 +29,7 @@ from space_dist.learner import make_learner
 from space_dist.learner.normaliser import _discounted
 from space_dist.ledger import METRICS, Ledger
 from space_dist.rollout import Rollout, Setup, Shard, Stage, Worker, collect, collecting
+from space_dist.rollout.episodes import rounds_over
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.run.launch import launch
 from space_dist.seeding import Purpose, generator
@@ -552,3 +553,12 @@ def test_every_member_of_a_population_meets_the_whole_selection() -> None:
     assert later.positions == (0, 13, 2, 15, 4, 17, 6, 19)
     new = dataclasses.replace(selection, version=1, order_version=1)
     assert [later.position(new, shard, four.walks) for shard in range(8)] == [0, 12] * 4
+
+
+@settings(deadline=None)
+@given(horizon=st.integers(1, 400), n_steps=st.integers(1, 10_000), episodes=st.integers(1, 2_000))
+@example(horizon=7, n_steps=300, episodes=300)  # 300 / (300 / 7) is more than 7
+def test_an_iteration_is_no_round_longer_than_its_passes_take(horizon: int, n_steps: int, episodes: int) -> None:
+    rounds = rounds_over(float(episodes), horizon, n_steps)
+    assert rounds * n_steps >= episodes * horizon
+    assert rounds == 1 or (rounds - 1) * n_steps < episodes * horizon

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -81,3 +82,12 @@ def summed(shards: Sequence[Shard], *, lag: int) -> dict[str, float]:
         sums["length"] += float(episodes.lengths.sum())
         sums["success"] += float(episodes.success.sum())
     return sums
+
+
+def rounds_over(episodes: float, horizon: int, n_steps: int) -> int:
+    """Rounds of `n_steps` transitions that have room for so many episodes at full horizon; at least one.
+
+    Source: decision 8 of docs/algorithm.md.
+    """
+    # Multiplied first: 300 episodes of 7 steps in rounds of 300 steps are 7 rounds, and 300 / (300 / 7) is more than 7.
+    return max(1, math.ceil(episodes * horizon / n_steps))

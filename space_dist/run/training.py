@@ -49,7 +49,7 @@ from space_dist.ledger import (
     encode_values,
 )
 from space_dist.rollout import Outcomes, Setup, Shard, Split, joined
-from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, summed
+from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, rounds_over, summed
 from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
@@ -332,9 +332,11 @@ class Training:
         """Rounds of an iteration: as many as pass over the selection at full horizon, and one of what is drawn."""
         config = self._config
         episodes = config.rollout.passes * len(selection.ids)
-        per_round = config.n_episodes or config.learner.n_steps / self._horizon  # of each policy: all pass over it
-        # Decision 8 of docs/algorithm.md.
-        return 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
+        if selection.drawn:
+            return 1
+        if config.n_episodes is not None:
+            return max(1, math.ceil(episodes / config.n_episodes))
+        return rounds_over(episodes, self._horizon, config.learner.n_steps)  # of each policy: all pass over it
 
     def _evaluate(self, policy: Handle) -> None:
         run, cluster = self._run, self._cluster

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import math
 import random
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -53,7 +52,7 @@ from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Outcomes, Setup, Worker, endless
-from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes
+from space_dist.rollout.episodes import curriculum_episodes, joined_episodes, mean_sizes, rounds_over
 from space_dist.rollout.policy import Valuing
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.run.cluster import CurriculumHost, Evidence
@@ -227,8 +226,7 @@ class Session:
     def _adopt(self, state: State, selection: Selection, values: FloatArray) -> None:
         self.state, self.selection, self.values = state, selection, values
         episodes = self._asked.passes * len(selection.ids)
-        per_round = self._round_steps / self.env.horizon
-        self.rounds_left = 1 if selection.drawn else max(1, math.ceil(episodes / per_round))
+        self.rounds_left = 1 if selection.drawn else rounds_over(episodes, self.env.horizon, self._round_steps)
         if self.wrapped.normaliser is not None:
             self.scored = weights(self._model)
 
