@@ -182,3 +182,22 @@ def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> No
 def test_what_cannot_be_given_is_refused(model: Callable[[], Any], callback: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
         model().learn(16, callback=CurriculumCallback(**callback))
+
+
+def test_what_is_made_on_the_way_is_closed() -> None:
+    made, closed = list[Lesson](), list[Lesson]()
+
+    class Counted(Lesson):
+        def __init__(self) -> None:
+            super().__init__()
+            made.append(self)
+
+        def close(self) -> None:
+            closed.append(self)
+
+    env = ContextVecEnv(Counted, CONTEXTS, 2)
+    model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, seed=0, device="cpu")
+    model.learn(96, callback=CurriculumCallback("space"))
+    env.close()
+    assert len(made) > 2
+    assert sorted(map(id, closed)) == sorted(map(id, made))

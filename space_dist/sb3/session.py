@@ -180,7 +180,9 @@ class Session:
                 f"CurriculumCallback: {kind} plays episodes of its own, in which {name} could not act: it asks for "
                 + ("masks" if name == "MaskablePPO" else "what it remembers of the episode")
             )
-        if not knows_success(self.env.make_batched(1), self._host.curriculum.start()[1].contexts[:1]):
+        with self.env.opened(1) as env:
+            success_is_known = knows_success(env, self._host.curriculum.start()[1].contexts[:1])
+        if not success_is_known:
             raise ConfigError(
                 f"CurriculumCallback: {kind} needs to know whether an episode succeeded, and the environment does not "
                 "say (its steps have no `success`)"
@@ -188,7 +190,9 @@ class Session:
 
     def _refuse_blindness(self) -> None:
         contexts = self.env.instances.contexts[:_COMPARED_STARTS]
-        if starts_alike(self.env.make_batched(len(contexts)), contexts):
+        with self.env.opened(len(contexts)) as env:
+            blind = starts_alike(env, contexts)
+        if blind:
             raise ConfigError(
                 f"CurriculumCallback: {self._asked.curriculum.kind} ranks instances by the value of their start, but "
                 "all instances start with the same observation, so all values tie and the order would be a random one. "
@@ -353,13 +357,14 @@ class Session:
         with _random_apart(env.run_seed, version):
             for first in range(0, len(indices), env.num_envs):
                 some = slice(first, first + env.num_envs)
-                outcomes.append(self._played(env.instances.contexts[indices[some]], seeds[some]))
+                with env.opened(len(indices[some])) as played:
+                    outcomes.append(self._played(played, env.instances.contexts[indices[some]], seeds[some]))
         model.num_timesteps += sum(int(part.lengths.sum()) for part in outcomes)
         return outcomes
 
-    def _played(self, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Outcomes:
-        """Episodes of (k, d) contexts with (k,) seeds, in one batch."""
-        env, count = self.env.make_batched(len(contexts)), len(contexts)
+    def _played(self, env: BatchedEnv, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Outcomes:
+        """Episodes of (k, d) contexts with (k,) seeds, in one batch of `env`, which has k slots."""
+        count = len(contexts)
         observations = take(env.reset(np.arange(count), contexts, seeds), slice(None))
         alive, success = np.ones(count, dtype=np.bool_), np.full(count, np.nan)
         returns, discounted, backward = np.zeros(count), np.zeros(count), np.zeros(count)

@@ -7,8 +7,9 @@ all instances. It keeps the books that `rollout.collect` keeps, so that what a c
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -23,8 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from space_dist.curricula import Selection
-from space_dist.envs import BatchedEnv, BatchedSingles, Drawable, make_batched, unwrapped
-from space_dist.envs.interface import Closable
+from space_dist.envs import BatchedEnv, BatchedSingles, Drawable, close, make_batched, unwrapped
 from space_dist.envs.observations import Observations, allocate, concatenate, put, take
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
@@ -110,6 +110,15 @@ class ContextVecEnv(VecEnv):
     def make_batched(self, n_slots: int) -> BatchedEnv:
         """Another such environment, with `n_slots` slots."""
         return make_batched(self._env, n_slots, context_visible=self.context_visible, kwargs=self._kwargs)
+
+    @contextlib.contextmanager
+    def opened(self, n_slots: int) -> Iterator[BatchedEnv]:
+        """Such an environment, closed afterwards."""
+        batched = self.make_batched(n_slots)
+        try:
+            yield batched
+        finally:
+            close(batched)
 
     # ---- rounds ----
 
@@ -252,12 +261,7 @@ class ContextVecEnv(VecEnv):
 
     def close(self) -> None:
         """Free what the environments hold."""
-        env = unwrapped(self._batched)
-        if isinstance(env, BatchedSingles):
-            for slot in range(self.num_envs):
-                env.single(slot).close()
-        elif isinstance(env, Closable):
-            env.close()
+        close(unwrapped(self._batched))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """See `VecEnv`."""
