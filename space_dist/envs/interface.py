@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -105,6 +106,16 @@ def close(env: BatchedEnv) -> None:
 
 
 MakeBatched = Callable[[int], BatchedEnv]
+
+
+@contextlib.contextmanager
+def opened(make: MakeBatched, n_slots: int) -> Iterator[BatchedEnv]:
+    """A new environment for as long as the context lasts."""
+    env = make(n_slots)
+    try:
+        yield env
+    finally:
+        close(env)
 
 
 @runtime_checkable

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 from gymnasium import spaces
 
 from space_dist.envs import BULLET_IDS, BatchedEnv, close, make_batched, unwrapped
-from space_dist.envs.interface import Compilable, FloatArray, knows_success, starts_alike
+from space_dist.envs.interface import Compilable, FloatArray, knows_success, opened, starts_alike
 from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
@@ -49,14 +50,9 @@ class EnvironmentSpec:
             inner.compile_physics()
         return env
 
-    @contextlib.contextmanager
-    def opened(self, n_slots: int) -> Iterator[BatchedEnv]:
+    def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
         """A new environment for as long as the context lasts."""
-        env = self.make(n_slots)
-        try:
-            yield env
-        finally:
-            close(env)
+        return opened(self.make, n_slots)
 
     def knows_success(self, contexts: FloatArray) -> bool:
         """Whether a first step in a (1, d) context reports success, true or not.

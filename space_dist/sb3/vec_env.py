@@ -7,9 +7,9 @@ all instances. It keeps the books that `rollout.collect` keeps, so that what a c
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, BatchedSingles, Drawable, close, make_batched, unwrapped
+from space_dist.envs.interface import opened
 from space_dist.envs.observations import Observations, allocate, concatenate, put, take
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
@@ -111,14 +112,9 @@ class ContextVecEnv(VecEnv):
         """Another such environment, with `n_slots` slots."""
         return make_batched(self._env, n_slots, context_visible=self.context_visible, kwargs=self._kwargs)
 
-    @contextlib.contextmanager
-    def opened(self, n_slots: int) -> Iterator[BatchedEnv]:
-        """Such an environment, closed afterwards."""
-        batched = self.make_batched(n_slots)
-        try:
-            yield batched
-        finally:
-            close(batched)
+    def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
+        """Such an environment, for as long as the context lasts."""
+        return opened(self.make_batched, n_slots)
 
     # ---- rounds ----
 
