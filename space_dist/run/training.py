@@ -54,6 +54,7 @@ from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
+from space_dist.run.rows import iteration_row, position, summary, trained_row
 from space_dist.run.starting import start_from
 from space_dist.run.state import RunState
 
@@ -341,7 +342,7 @@ class Training:
     def _evaluate(self, policy: Handle) -> None:
         run, cluster = self._run, self._cluster
         settings = self._config.evaluation
-        row: Row = {"kind": "evaluation", **self._position()}
+        row: Row = {"kind": "evaluation", **position(self._run)}
         splits: tuple[Split, ...] = ("train", "test")
         asked = {split: cluster.evaluate(policy, split) for split in splits}
         legacy = {split: cluster.evaluate(policy, split, stochastic=True) for split in splits if settings.legacy_metric}
@@ -351,7 +352,7 @@ class Training:
             arrived = iter(answers)
             for split in splits:
                 outcomes = joined([next(arrived) for _ in asked[split]])
-                row[split] = _summary(outcomes, len(self._setup.instances(split)), settings.episodes)
+                row[split] = summary(outcomes, len(self._setup.instances(split)), settings.episodes)
             for split in legacy:
                 outcomes = joined([next(arrived) for _ in legacy[split]])
                 # The metric of the released code's plots: the last reward counts most.
@@ -452,38 +453,12 @@ class Training:
         return answers[: len(handles)]
 
     def _iteration_row(self, *, complete: bool) -> Row:
-        """One iteration in numbers, and its row of the curriculum's history."""
+        """One iteration in numbers; its row of the curriculum's history is written here."""
         run, selection = self._run, self._asked.trained
         if selection is None:
             raise RuntimeError("an iteration ended before its selection was known")
-        trained: Row = {"trained": selection.ids.tolist()}
-        if selection.drawn:  # the draws whose episodes ended
-            seen = joined_episodes(run.seen)
-            generated = seen.indices == GENERATED
-            trained = {"trained": np.where(generated, GENERATED, self._setup.train.ids[seen.indices]).tolist()}
-            trained |= {"contexts": seen.contexts.tolist()} if generated.any() else {}
-        self._writer.append(CURRICULUM, {"iteration": run.iteration, "steps": run.steps, **trained})
-        totals = {name: sum(one[name] for one in run.rollouts) for name in run.rollouts[0]}
-        episodes = int(totals["episodes"])
-        return {
-            "kind": "iteration",
-            **self._position(),
-            "complete": complete,
-            "episodes": episodes,
-            "gradient_steps": run.gradient_steps,
-            **({"lagged_steps": int(totals["lagged"])} if self._config.rollout.overlap else {}),
-            "rollout": {
-                name: totals[name] / episodes if episodes and math.isfinite(totals[name]) else None
-                for name in ("return", "discounted_return", "length", "success")
-            },
-            "learner": {
-                name: float(np.mean([update[name] for update in run.updates if name in update]))
-                for name in sorted({name for update in run.updates for name in update})
-            },
-        }
-
-    def _position(self) -> Row:
-        return {"iteration": self._run.iteration, "round": self._run.round, "steps": self._run.steps}
+        self._writer.append(CURRICULUM, trained_row(run, selection, self._setup.train))
+        return iteration_row(run, complete=complete, overlap=self._config.rollout.overlap)
 
     def _append(self, row: Row) -> None:
         now = time.monotonic()
@@ -587,15 +562,3 @@ def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int
         marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
         return next(mark for mark in marks if mark > evaluated_at)
     return (evaluated_at // every_steps + 1) * every_steps
-
-
-def _summary(outcomes: Outcomes, instances: int, episodes: int) -> dict[str, Any]:
-    """Means over a split, and each instance's mean return in id order; over all policies, where there are several."""
-    returns = checked(outcomes.returns, "returns")
-    return {
-        "return": float(returns.mean()),
-        "discounted_return": float(outcomes.discounted_returns.mean()),
-        "length": float(outcomes.lengths.mean()),
-        "success": None if np.isnan(outcomes.success).any() else float(outcomes.success.mean()),
-        "returns": returns.reshape(-1, instances, episodes).mean(axis=(0, 2)).tolist(),
-    }
