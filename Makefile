@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: quickstart test check docs ui setup clean
+.PHONY: quickstart test check docs results ui setup clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,10 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# One artefact of the paper, run and kept in docs/results: make results NAME=pointmass_uniform; in small: SCALE=0.02.
+results: $(STAMP)
+	$(BIN)/python jobs/results.py $(NAME) --scale $(or $(SCALE),1.0)
 
 # The documentation as a site, in site/: open site/index.html. Warnings are errors.
 docs: $(STAMP)

@@ -373,7 +373,7 @@ def test_the_page_needs_nothing_else(written: Path) -> None:
     text = (written / "report.html").read_text()
     page = Page(text)
     assert not page.tags & {"script", "link", "iframe", "object", "b"}
-    assert len(page.addresses) == 2
+    assert len(page.addresses) == 4  # curves, heat map, profiles, instances
     assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
     assert "url(" not in text
     assert "@import" not in text

@@ -100,7 +100,8 @@ def reports(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The grids that were reported on, with a page instead of a report: drawing takes seconds."""
     made: list[Path] = []
 
-    def write(grid: Grid, out: Path) -> None:
+    def write(grid: Grid, out: Path, *, in_depth: bool) -> None:
+        assert not in_depth  # it is made again and again
         made.append(grid.folder)
         (out / "report.html").write_text("a report")
 

@@ -31,10 +31,11 @@ def fewer(seeds: Sequence[int], scale: float) -> tuple[int, ...]:
 
 
 def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
-    """A run of that share of the budget, at least one update of it, evaluated as often as the whole one.
+    """A run of that share of the budget, at least one update of it.
 
-    All else stays, so schedules over the budget are steeper, and a set that grows by one gets less far. `where` names
-    the config in errors. Raises ConfigError if the result is no config.
+    There are fewer evaluations, by the share's square root: curves remain, and evaluating costs less as well. All else
+    stays, so schedules over the budget are steeper, and a set that grows by one gets less far. `where` names the config
+    in errors. Raises ConfigError if the result is no config.
     """
     if scale == WHOLE:
         return config
@@ -44,10 +45,12 @@ def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
     if budget["episodes"] is not None:
         budget["episodes"] = math.ceil(budget["episodes"] * scale - 1e-6)
     if isinstance(evaluation["every_steps"], int):
-        evaluation["every_steps"] = math.ceil(evaluation["every_steps"] * scale - 1e-6)
+        evaluation["every_steps"] = math.ceil(evaluation["every_steps"] * math.sqrt(scale) - 1e-6)
     return configs.parse(data, where)
 
 
-def in_words(scale: float) -> str:
+def in_words(scale: float, seeds: int) -> str:
     """For reports and figures; empty for a whole grid."""
-    return "" if scale == WHOLE else f"scale {scale:g}: {scale:.3g} of the seeds and of the steps of the whole grid"
+    if scale == WHOLE:
+        return ""
+    return f"scale {scale:g}: {100.0 * scale:.3g} % of the whole grid's steps, {seeds} seed{'s' if seeds > 1 else ''}"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from space_dist.report.figures import COLOURS, dress, empty_figure, style_of, wrapped
@@ -46,7 +47,8 @@ def draw_instances(labels: Sequence[str], curves: Sequence[tuple[IntArray, Float
     figure = empty_figure(4.8 * columns, 3.4 * rows)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, label, (steps, returns) in zip(grid.flat, labels, curves, strict=False):
-        axes.plot(steps, returns, color=COLOURS[4], linewidth=0.5, alpha=0.5)
+        lines = [np.column_stack((steps, own)) for own in returns.T]
+        axes.add_collection(LineCollection(lines, colors=COLOURS[4], linewidths=0.5, alpha=0.5))
         for share, line in zip(_TENTHS, ("--", "-", ":"), strict=True):
             name = "median" if share == 0.5 else f"{'worst' if share < 0.5 else 'best'} tenth begins"
             axes.plot(

@@ -33,6 +33,7 @@ from space_dist.report.load import FloatArray, IntArray, Run
 from space_dist.report.statistics import Interval, estimate
 from space_dist.report.tables import NONE, Value, interval_text, number_text
 
+_OF_SETS: Final = ("space", "cspace", "random_growth", "manual", "round_robin", "fixed")
 MAX_DRAWN: Final = 8  # cells in a figure of curricula
 MAX_AGREEING: Final = 12  # cells of the table of agreement
 
@@ -102,14 +103,7 @@ def _curricula_of(cell: CellRuns) -> CellCurricula | None:
 
 def _trains_on_sets(cell: CellRuns) -> bool:
     """Whether the ledger's `trained` are the sets themselves, and not the draws whose episodes ended."""
-    return cell.cell.config["curriculum"]["kind"] in (
-        "space",
-        "cspace",
-        "random_growth",
-        "manual",
-        "round_robin",
-        "fixed",
-    )
+    return cell.cell.config.get("curriculum", {}).get("kind") in _OF_SETS
 
 
 def _movement(run: Run, trained: Sequence[IntArray], contexts: FloatArray) -> tuple[float, float, float]:
@@ -133,8 +127,8 @@ def _table(found: Sequence[CellCurricula]) -> Section:
         alike = consistency(one.orders)
         rows.append(
             {
-                "cell": one.label,
-                "seeds": str(len(one.orders)),
+                "curriculum": one.label,
+                "seeds": f"{len(one.orders)}/{one.cell.summary.n_runs}",
                 "tau with the other seeds: mean, least": _mean_and_least(alike.with_others),
                 "tau of pairs: mean": _mean(alike.pairs, 3),
                 "set moves an iteration: mean, most": _movement_text(one),
@@ -157,7 +151,7 @@ def _agreement(found: Sequence[CellCurricula]) -> list[Section]:
     rows = []
     shown = found[:MAX_AGREEING]
     for one in shown:
-        row = {"cell": one.label}
+        row = {"curriculum": one.label}
         for other in shown:
             alike = np.array_equal(one.ids, other.ids) and _same(one.contexts, other.contexts)
             row[other.label] = f"{agreement(one.orders, other.orders):.2f}" if alike else NONE
@@ -189,7 +183,7 @@ def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
         caption = "Context features, scaled from their bounds: mean of the set, and of the instance at each rank"
         pictures.append(Picture("context_features.png", caption, png(draw_features(known[0].features, curves), note)))
     rows = [
-        {"cell": one.label, **{name: number_text(float(tau), 2) for name, tau in
+        {"curriculum": one.label, **{name: number_text(float(tau), 2) for name, tau in
                                zip(one.features, feature_rank_correlations(one.orders, one.contexts), strict=True)}}
         for one in known if one.contexts is not None and one.features == known[0].features
     ]  # fmt: skip

@@ -33,7 +33,7 @@ from space_dist.report.grid import (
 )
 from space_dist.report.instances import instance_sections
 from space_dist.report.load import Configuration
-from space_dist.report.measures import Measured, measure_numbers, measure_sections, measured, paired_cells
+from space_dist.report.measures import Measured, measure_numbers, measure_sections, measured, paired_cell
 from space_dist.report.statistics import FEWEST, Interval, estimate
 from space_dist.report.tables import (
     NONE,
@@ -102,13 +102,15 @@ class GridReport:
 
 
 def build_grid_report(
-    grid: Grid, out: Path | None = None, *, baseline: str | None = None, threshold: float | None = None
-) -> GridReport:
+    grid: Grid, out: Path | None = None, *, baseline: str | None = None, threshold: float | None = None,
+    in_depth: bool = True,
+) -> GridReport:  # fmt: skip
     """Report on a grid as it stands, finished or not; `out` is by default `report` in the grid's folder.
 
     baseline: label of a cell, or the start of its id; None: the manifest's. threshold: a test return; None: the
-    baseline's final IQM. Raises ConfigError for an unknown baseline, a threshold that is no finite number, or if `out`
-    cannot be written to; LedgerError if the manifest is missing or damaged.
+    baseline's final IQM. in_depth: look at curricula and at each instance as well, which takes seconds. Raises
+    ConfigError for an unknown baseline, a threshold that is no finite number, or if `out` cannot be written to;
+    LedgerError if the manifest is missing or damaged.
     """
     if threshold is not None and not math.isfinite(threshold):
         raise ConfigError(f"--threshold must be a finite number, not {threshold}")
@@ -125,8 +127,9 @@ def build_grid_report(
         raise ConfigError(f"{grid.manifest_file} names a baseline {chosen!r} that is none of its cells")
     compared = compare(cells, reference, threshold)
     measures = measured(cells, compared)
-    curricula = curricula_of(cells[:MAX_ANALYSED])
-    note = scaling.in_words(manifest.scale)
+    analysed = cells[:MAX_ANALYSED] if in_depth else []
+    curricula = curricula_of(analysed)
+    note = scaling.in_words(manifest.scale, len(manifest.seeds))
 
     summary = _summary(manifest, cells, reference, compared, threshold)
     remarks = _remarks(manifest, cells, compared)
@@ -146,9 +149,9 @@ def build_grid_report(
             *_maps(cells, note),
             *_pooled(cells),
             Section("Training", rows=[_training_row(cell) for cell in cells]),
-            *([Section("Instances and curricula", few)] if len(cells) > MAX_ANALYSED else []),
+            *([Section("Instances and curricula", few)] if 0 < len(analysed) < len(cells) else []),
             *curriculum_sections(curricula, note),
-            *instance_sections(cells[:MAX_ANALYSED], note),
+            *instance_sections(analysed, note),
         ]
     sections += [Section("Remarks", items=remarks)] if remarks else []
     document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
@@ -203,7 +206,9 @@ def _summary(
     every = "All" if done == n_runs else f"{done:,} of"
     sentences = [f"{every} {n_runs:,} runs are finished ({size}){f'; {rest}' if rest else ''}."]
     if manifest.scale != scaling.WHOLE:
-        sentences.append(f"A grid in small, {scaling.in_words(manifest.scale)}: no evidence for the whole one.")
+        sentences.append(
+            f"A grid in small, {scaling.in_words(manifest.scale, len(manifest.seeds))}: no evidence for the whole one."
+        )
     level = compared[cells.index(baseline)].threshold
     others = len({cell.task for cell in cells}) > 1
     counterparts = "; in other environments or test sets, its counterpart there" if others else ""
@@ -251,7 +256,7 @@ def _finals(
                 "mean [95 %]": _with_seeds(interval_text(test.mean), test.n, of),
                 "median [95 %]": _with_seeds(interval_text(test.median), test.n, of),
                 "P(better) [95 %]": _improvement(cell, comparison),
-                **paired_cells(found["final"]),
+                **paired_cell(found["final"], of),
             }
         )
     return rows

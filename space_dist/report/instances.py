@@ -83,12 +83,12 @@ def _forgetting(cells: Sequence[CellRuns], curves: Curves) -> list[Section]:
         if min(len(returns) for returns in own) < FEWEST:
             continue
         whole = span([returns for other in cells if other.task == cell.task for _, returns in curves[other.cell.id]])
-        row = {"cell": cell.label, "held-out instances": f"{own[0].shape[1]:,}"}
+        row, most = {"cell": cell.label}, own[0].shape[1]
         for share in SHARES:
             counts = np.array([forgotten(returns, share * whole).sum() for returns in own], dtype=np.float64)
             found = estimate(counts).mean
-            row[f"fall by {100 * share:g} % of the range, mean [95 %]"] = interval_text(
-                found.within(0.0, own[0].shape[1]), 1
+            row[f"fall by {100 * share:g} % of the range, mean [95 %]"] = (
+                f"{interval_text(found.within(0.0, most), 1)} of {most:,} ({len(own)}/{cell.summary.n_runs})"
             )
         rows.append(row)
     if not rows:

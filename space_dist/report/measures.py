@@ -32,11 +32,13 @@ MEASURES: Final[Mapping[str, str]] = {
 class Measured:
     """One measure of a cell: the IQM over its finished seeds, and how it compares with the reference, by seed.
 
-    n: seeds. improvement, difference: None for the reference itself, and where there is none.
+    n, against: seeds, and those of the reference. improvement, difference: None for the reference itself, and where
+    there is none.
     """
 
     n: int
     iqm: Interval
+    against: int = 0
     improvement: Interval | None = None
     difference: PairedDifference | None = None
 
@@ -64,6 +66,7 @@ def _measured(known: Estimate, ours: Mapping[int, float], theirs: Mapping[int, f
     return Measured(
         known.n,
         known.iqm,
+        len(theirs),
         probability_of_improvement(np.array([*ours.values()]), np.array([*theirs.values()])),
         paired_difference(*pairs) if both else None,
     )
@@ -103,8 +106,8 @@ def measure_sections(
             {
                 "cell": label,
                 "IQM [95 %]": f"{interval_text(row[name].iqm)} ({row[name].n}/{cell.summary.n_runs})",
-                "P(better) [95 %]": _improvement(row[name].improvement),
-                **paired_cells(row[name]),
+                "P(better) [95 %]": _improvement(row[name], cell.summary.n_runs),
+                **paired_cell(row[name], cell.summary.n_runs),
             }
             for cell, label, row in zip(cells, names, found, strict=True)
         ]
@@ -112,23 +115,19 @@ def measure_sections(
     return sections
 
 
-def paired_cells(found: Measured) -> dict[str, str]:
-    """Columns of a table: the difference by seed, and its test."""
-    return {"difference by seed [95 %]": _difference(found.difference), "Wilcoxon p": _p(found.difference)}
+def paired_cell(found: Measured, n_seeds: int) -> dict[str, str]:
+    """A column of a table: the difference by seed, and its test, and on how many of the cell's seeds they rest."""
+    pairs = found.difference
+    if pairs is None:
+        return {"difference by seed [95 %], Wilcoxon p": NONE}
+    p = NONE if math.isnan(pairs.p) else f"{pairs.p:.3g}"
+    return {"difference by seed [95 %], Wilcoxon p": f"{interval_text(pairs.mean)}, {p} ({pairs.n}/{n_seeds} pairs)"}
 
 
-def _improvement(found: Interval | None) -> str:
-    return NONE if found is None else interval_text(found, 2)
-
-
-def _difference(found: PairedDifference | None) -> str:
-    if found is None:
+def _improvement(found: Measured, n_seeds: int) -> str:
+    if found.improvement is None:
         return NONE
-    return f"{interval_text(found.mean)} ({found.n} pairs)"
-
-
-def _p(found: PairedDifference | None) -> str:
-    return NONE if found is None or math.isnan(found.p) else f"{found.p:.3g}"
+    return f"{interval_text(found.improvement, 2)} ({found.n}/{n_seeds} against {found.against})"
 
 
 def measure_numbers(found: Mapping[str, Measured]) -> dict[str, Value]:

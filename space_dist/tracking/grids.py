@@ -340,7 +340,7 @@ class GridMirror:
             # Before it is made: one that cannot be made is not tried at every look.
             self._reported = time.monotonic()
             try:
-                report.build_grid_report(self.grid, folder)
+                report.build_grid_report(self.grid, folder, in_depth=False)  # it is made again and again
             except SpaceDistError as error:
                 log.warning("%s: its report was not made: %s", self.grid.folder, error)
 

@@ -1,0 +1,106 @@
+"""The paper's grids: each can be run whole and in small, and one command makes what it shows, always the same."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from space_dist.config import read_yaml
+from space_dist.envs.distributions import sample
+from space_dist.experiment.manifest import load_grid
+from space_dist.grid.planning import plan
+from tests.patience import PATIENCE
+
+ROOT = Path(__file__).resolve().parent.parent
+GRIDS = sorted(path.stem for path in (ROOT / "configs/paper").glob("*.yaml"))
+INSTANCES = ROOT / "configs/instances"
+
+
+def grid_file(name: str) -> Path:
+    return ROOT / f"configs/paper/{name}.yaml"
+
+
+def test_every_row_of_the_page_has_its_grid() -> None:
+    page = (ROOT / "docs/results.md").read_text()
+    rows = [line.split("|") for line in page.splitlines() if line.startswith("| C")]
+    assert len(rows) == 18
+    named = {name.strip(" `") for row in rows for name in row[3].replace(", 100 mazes", "").split(",")}
+    assert named <= {*GRIDS}
+    assert {"cartpole", "ant", "ball_catching", "pointmass_uniform", "maze", "pointmass_table1", "pointmass_multiply",
+            "ant_vds", "pointmass_target", "pointmass_sizes", "rivals"} <= {*GRIDS}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_grid_of_the_paper_is_whole_and_can_be_run_in_small(name: str, tmp_path: Path) -> None:
+    """Ten seeds, and evaluations of which one half chooses instances and the other measures them."""
+    grid, cells = load_grid(grid_file(name))
+    assert len(grid.seed_list()) == 10
+    assert all(data["evaluation"]["episodes"] % 2 == 0 for _, data in cells)
+    assert grid.name == f"paper-{name.replace('_', '-')}"
+    small = plan(grid_file(name), tmp_path, 0.02)
+    assert (len(small.manifest.cells), len(small.manifest.seeds)) == (len(cells), 1)
+    assert small.manifest.name == f"{grid.name}-scale-0.02"
+    assert small.steps <= 0.0025 * sum(data["budget"]["steps"] for _, data in cells) * 10 + 10_000 * len(cells)
+
+
+def test_the_table_has_the_papers_settings() -> None:
+    for name in ("pointmass_table1", "pointmass_table1_trpo"):
+        axes = read_yaml(grid_file(name))["grid"]
+        assert axes == {"curriculum.kappa": [1, 4, 16, 32], "curriculum.eta": [0.05, 0.1, 0.2, 0.4]}
+
+
+def test_the_sets_of_all_sizes_are_the_first_rows_of_one() -> None:
+    """And what `space-dist instances sample` draws."""
+    train, test = sample("pointmass_uniform", 1600, 100, 0)
+    lines = train.to_csv().splitlines(keepends=True)
+    for count in (25, 50, 100, 200, 400, 800, 1600):
+        assert (INSTANCES / f"pointmass_sizes_train_{count}.csv").read_text() == "".join(lines[: count + 1])
+    assert (INSTANCES / "pointmass_sizes_test.csv").read_text() == test.to_csv()
+
+
+@pytest.mark.parametrize(("name", "distribution", "count"), [
+    ("maze_dfs_1000", "maze_dfs", 1000), ("pointmass_goal", "pointmass_goal", 100)
+])  # fmt: skip
+def test_the_other_sets_are_what_is_drawn(name: str, distribution: str, count: int) -> None:
+    for split, drawn in zip(("train", "test"), sample(distribution, count, 100, 0), strict=True):
+        assert (INSTANCES / f"{name}_{split}.csv").read_text() == drawn.to_csv()
+
+
+def test_only_the_goal_varies() -> None:
+    train, test = sample("pointmass_goal", 50, 50, 3)
+    assert {*train.contexts[:, 2], *test.contexts[:, 2]} == {2.0}
+    assert len({*train.contexts[:, 0]}) == 50
+
+
+def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, ROOT / "jobs/results.py", *arguments, "--root", folder / "runs", "--out", folder / "out"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+
+
+def test_one_command_makes_an_artefact_always_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
+    results: list[dict[str, bytes]] = []
+    for attempt in ("first", "second"):
+        done = make(tmp_path / attempt, "cartpole", "--scale", "0.02")
+        assert done.returncode == 0, done.stdout + done.stderr
+        folder = tmp_path / attempt / "out/cartpole-scale-0.02"
+        results.append({path.name: path.read_bytes() for path in sorted(folder.iterdir())})
+    first, second = results
+    assert {"cells.csv", "curves.csv", "curves.png", "profiles.png", "provenance.json", "report.md"} <= first.keys()
+    assert first == second
+    provenance = json.loads(first["provenance.json"])
+    assert provenance["command"] == "make results NAME=cartpole SCALE=0.02"
+    assert (provenance["scale"], provenance["seeds"], provenance["cells"]) == (0.02, [0], 4)
+    assert provenance["environment_steps"] > 0
+    assert len(provenance["arithmetic"]) == 1
+    assert "A grid in small, scale 0.02" in first["report.md"].decode()
+
+
+def test_an_unknown_artefact_is_one_sentence(tmp_path: Path) -> None:
+    done = make(tmp_path, "cartpol")
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+    assert "'cartpol' is no grid of the paper; did you mean 'cartpole'?" in " ".join(done.stderr.split())
