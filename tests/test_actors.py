@@ -133,3 +133,20 @@ def test_actors_close_their_environments_where_a_run_ends(tmp_path: Path) -> Non
     files = [path.name for path in noted.iterdir()]
     assert len({name.partition("-")[0] for name in files}) == 3  # processes: two actors, and the driver, to look at one
     assert [name for name in files if not name.endswith(".closed")] == []
+
+
+@pytest.mark.parametrize(("fault", "ends"), [("exit", "failed"), ("_exit", "done")])
+def test_an_exit_with_0_in_an_actor_never_passes_for_success(fault: str, ends: str, tmp_path: Path) -> None:
+    """`sys.exit` is an error of the environment's; an actor that is gone is replaced, and its work is done again."""
+    section = learner_section("ppo", n_steps=32, net_arch=[4])
+    section |= {"n_epochs": 1}
+    env = {"id": "tests.fault_env:make", "kwargs": {"fault": fault, "marker": str(tmp_path / "marker")}}
+    run = config_for(tmp_path, section, env=env, budget={"steps": 960}, rollout={"shards": 2, "slots": 2},
+                     resources={"workers": 1})  # fmt: skip
+    if ends == "failed":
+        with pytest.raises(SpaceDistError, match="SystemExit: 0"):
+            launch(run, tmp_path / "run", resume=True, stop=StopRequests())
+    else:
+        launch(run, tmp_path / "run", resume=True, stop=StopRequests())
+    assert (tmp_path / "marker").exists()
+    assert Ledger(tmp_path / "run").status().state == ends

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from space_dist.api.progress import line_of_grid, shown
 from space_dist.experiment import manifest as manifests
+from space_dist.experiment import scaling
 from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
@@ -73,12 +74,14 @@ def run_grid(
     *,
     root: Path | str | None = None,
     max_parallel: int | None = None,
+    scale: float = scaling.WHOLE,
     progress: bool | Callable[[Overview], None] = True,
 ) -> GridRun:
     """Work through a grid on this machine, as `space-dist grid run` does: what is done is skipped.
 
     grid: its YAML file, `shipped:NAME`, its folder, or its manifest.json.  root: the folder that holds grids' folders;
-    None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  progress: show a line that
+    None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  scale: the
+    share of a YAML file's seeds and steps, in a folder of its own (`<name>-scale-<scale>`).  progress: show a line that
     changes in its place; or what is called now and then.
 
     Runs that fail are noted (`GridRun.statuses`) and raise nothing. Raises ConfigError for every fault of the files,
@@ -87,7 +90,7 @@ def run_grid(
     look_here_too()
     base = workplace() / "runs" if root is None else lasting(Path(root), "root")
     named = grid.folder if isinstance(grid, Grid | GridRun) else Path(grid)
-    place, manifest = frozen(named, base)
+    place, manifest = frozen(named, base, scale)
     stop = StopRequests()
     with shown(progress is True) as show:
 
@@ -101,15 +104,18 @@ def run_grid(
     return GridRun(place.folder)
 
 
-def frozen(path: Path, root: Path) -> tuple[Grid, Manifest]:
-    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere."""
+def frozen(path: Path, root: Path, scale: float = scaling.WHOLE) -> tuple[Grid, Manifest]:
+    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere.
+
+    scale: the share of the seeds and steps in YAML.
+    """
     if path.is_dir() or path.name == MANIFEST:
-        source = find_grid(path, root)
+        source = find_grid(path, root, scale)
         place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
         return place, place.manifest()
     from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
 
-    made = plan(path, root)
+    made = plan(path, root, scale)
     return made.grid, made.manifest
 
 

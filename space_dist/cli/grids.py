@@ -35,6 +35,10 @@ Root = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads annotations at run time
     typer.Option(help="Folder that holds the grids' folders. Default: runs; within a Ray job ~/space_dist/runs."),
 ]
+Scale = Annotated[
+    float,
+    typer.Option(help="Of a YAML file: this share of its seeds and steps, in a folder of its own, NAME-scale-SCALE."),
+]
 JobServer = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(help="The cluster's job server, where its storage is not seen from here."),
@@ -48,13 +52,13 @@ _UNFINISHED = 3  # the exit code of `grid status` where runs are still to be don
 
 
 @grid_app.command("plan")
-def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
+def grid_plan(grid: GridPath, root: Root = None, scale: Scale = 1.0, as_json: Json = False) -> None:
     """Check a grid, print its cells and what is done already, and freeze its manifest."""
     from space_dist.experiment.status import run_statuses
     from space_dist.grid.planning import plan
     from space_dist.system.provenance import code_digest
 
-    made = plan(grid, _root(root))
+    made = plan(grid, _root(root), scale)
     manifest = made.manifest
     found = run_statuses(made.grid, manifest, code_digest())
     done = [run_status for run_status in found if run_status.condition == "done"]
@@ -85,6 +89,7 @@ def grid_plan(grid: GridPath, root: Root = None, as_json: Json = False) -> None:
 def grid_run(
     grid: GridPath,
     root: Root = None,
+    scale: Scale = 1.0,
     max_parallel: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
@@ -118,7 +123,7 @@ def grid_run(
     _prepare(address)
     from space_dist.api.grids import frozen
 
-    place, manifest = frozen(grid, _root(root))
+    place, manifest = frozen(grid, _root(root), scale)
     if digest is not None and digest != manifest.runs_digest:
         raise ConfigError(
             f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
@@ -137,6 +142,7 @@ def grid_submit(
     grid: GridPath,
     address: Annotated[str, typer.Option(help="The cluster's job server, like http://127.0.0.1:8265.")],
     root: Root = None,
+    scale: Scale = 1.0,
     max_in_flight: Annotated[
         str, typer.Option(help="Runs at a time: auto (as many as there are CPUs for), or a number.")
     ] = "auto",
@@ -159,7 +165,7 @@ def grid_submit(
     chosen = _mode(mode)
     limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
     base = _root(root)
-    place, manifest = frozen(grid, base)
+    place, manifest = frozen(grid, base, scale)
     remote = Remote(address, manifest, base)
     job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
     say(f"{manifest.name}: conducted by job {job} at {address}")
@@ -181,6 +187,7 @@ def grid_submit(
 def grid_status(
     grid: GridPath,
     root: Root = None,
+    scale: Scale = 1.0,
     watch: Annotated[bool, typer.Option("--watch", help="Go on showing until nothing is left to do.")] = False,
     as_json: Json = False,
     by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
@@ -190,7 +197,7 @@ def grid_status(
     from space_dist.experiment.status import exit_code
     from space_dist.slurm.queue import queue_of
 
-    place, manifest = _found(grid, root)
+    place, manifest = _found(grid, root, scale)
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
     queue, asked = queue_of(place.folder), time.monotonic()
@@ -368,11 +375,11 @@ def _root(root: Path | None) -> Path:
     return workplace() / "runs" if root is None else lasting(root, "--root")
 
 
-def _found(path: Path, root: Path | None) -> tuple[Grid, Manifest]:
+def _found(path: Path, root: Path | None, scale: float = 1.0) -> tuple[Grid, Manifest]:
     """A grid that was frozen before, however the user names it."""
     from space_dist.experiment.manifest import find_grid
 
-    place = find_grid(path, _root(root))
+    place = find_grid(path, _root(root), scale)
     return place, place.manifest()
 
 

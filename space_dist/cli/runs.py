@@ -191,6 +191,7 @@ def report(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Of a grid's YAML file: folder that holds the grids' folders, as of `space-dist grid`."),
     ] = None,
+    scale: Annotated[float, typer.Option(help="Of a grid's YAML file: the scale at which it was run.")] = 1.0,
 ) -> None:
     """Compare runs, or the cells of a grid: figures and tables with 95 % intervals over seeds."""
     from space_dist.api.reports import is_grid
@@ -200,21 +201,21 @@ def report(
 
     paths = [located(path) for path in paths]
     if len(paths) == 1 and is_grid(paths[0]):
-        grid = _grid(paths[0], root)
+        grid = _grid(paths[0], root, scale)
         print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
         return
     if grids := [path for path in paths if is_grid(path)]:
         raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
-    if baseline is not None or threshold is not None:
-        raise ConfigError(f"--baseline and --threshold are for grids; {paths[0]} is none")
+    if baseline is not None or threshold is not None or scale != 1.0:
+        raise ConfigError(f"--baseline, --threshold and --scale are for grids; {paths[0]} is none")
     print_report(build_report(find_ledgers(paths), Path("report") if out is None else out), console)
 
 
-def _grid(path: Path, root: Path | None) -> Grid:
+def _grid(path: Path, root: Path | None, scale: float) -> Grid:
     from space_dist.experiment.manifest import find_grid
     from space_dist.system.workplace import workplace
 
-    return find_grid(path, workplace() / "runs" if root is None else root)
+    return find_grid(path, workplace() / "runs" if root is None else root, scale)
 
 
 def print_report(result: Report, to: Console) -> None:

@@ -50,6 +50,13 @@ def _draw_target(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
     return np.clip(drawn, BOUNDS.low, BOUNDS.high)
 
 
+def _draw_goal(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """Gates uniform within the bounds, friction always in the middle of its own."""
+    drawn = _draw_uniform(rng, n)
+    drawn[:, 2] = (BOUNDS.low[2] + BOUNDS.high[2]) / 2.0
+    return drawn
+
+
 DISTRIBUTIONS: Final = {
     "pointmass_uniform": Distribution(
         description="PointMass, each feature uniform within its bounds",
@@ -63,6 +70,12 @@ DISTRIBUTIONS: Final = {
         source="Klink et al. 2020 (the target distribution); the clipping is ours",
         bounds=BOUNDS,
         draw=_draw_target,
+    ),
+    "pointmass_goal": Distribution(
+        description="PointMass, the gate uniform within its bounds, friction always 2: only the goal varies",
+        source="the SPaCE paper's appendix on forgetting has such a set, without numbers; these are ours",
+        bounds=BOUNDS,
+        draw=_draw_goal,
     ),
 }
 

@@ -25,6 +25,7 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, Mirrors, Patience, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
+from space_dist.experiment import scaling
 from space_dist.ledger import Ledger, owner_alive
 from space_dist.system.files import atomic_write
 
@@ -301,6 +302,7 @@ class Manifest:
 
     axes: config keys in which cells differ. baseline: id of the cell that reports compare with. code, git: the version
     of this package that froze it. instances: file name in the grid's `instances` folder -> SHA-256 of its content.
+    scale: the share of the grid's seeds and steps that this is.
     """
 
     name: str
@@ -314,6 +316,7 @@ class Manifest:
     instances: Mapping[str, str]
     code: str
     git: Mapping[str, str]
+    scale: float = scaling.WHOLE
 
     def runs(self) -> list[Run]:
         """Every run, seed by seed, so that all cells can be compared early on."""
@@ -364,6 +367,7 @@ class Manifest:
             "resources": self.resources.model_dump(), "retry": self.retry.model_dump(),
             "tracking": self.tracking.model_dump(),
             "baseline": self.baseline, "instances": dict(self.instances), "code": self.code, "git": dict(self.git),
+            **({} if self.scale == scaling.WHOLE else {"scale": self.scale}),
         }  # fmt: skip
         data["sha256"] = _sha256(data)
         return json.dumps(data, indent=1, sort_keys=True).encode() + b"\n"
@@ -477,21 +481,26 @@ class Grid:
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")
 
 
-def find_grid(path: Path, root: Path) -> Grid:
-    """The grid that a user names: its folder, its manifest.json, or its YAML file (frozen below `root`).
+def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
+    """The grid that a user names: its folder, its manifest.json, or its YAML file (frozen below `root`, at a scale).
 
-    Raises ConfigError if there is nothing of the kind, LedgerError if a YAML file's grid was never frozen.
+    Raises ConfigError if there is nothing of the kind, and for a scale of what is frozen already; LedgerError if a YAML
+    file's grid was never frozen.
     """
+    if scale != scaling.WHOLE and (path.is_dir() or path.name == MANIFEST):
+        raise ConfigError(f"{path} is frozen already, with its seeds and steps; --scale is for a grid's YAML file")
     if path.is_dir():
         if not (path / MANIFEST).exists():
             raise LedgerError(f"{path} holds no grid: it has no {MANIFEST}")
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
-    grid = Grid(root / configs.check(GridConfig, configs.read_yaml(configs.located(path)), str(path)).name)
+    config = configs.check(GridConfig, configs.read_yaml(configs.located(path)), str(path))
+    grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale)))
     if not grid.manifest_file.exists():
+        small = "" if scale == scaling.WHOLE else f" --scale {scale:g}"
         raise LedgerError(
-            f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}` freezes it there "
+            f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}{small}` freezes it there "
             "(--root names another root)"
         )
     return grid

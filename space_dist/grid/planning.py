@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from space_dist import config as configs
+from space_dist.config import RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, about
+from space_dist.experiment import scaling
 from space_dist.experiment.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
 from space_dist.grid.conductor import freeze
 from space_dist.instances import InstanceSet
@@ -32,32 +34,35 @@ class Plan:
     dropped_runs: int
 
 
-def plan(path: Path, root: Path) -> Plan:
-    """Resolve and check a grid file, and freeze it in `<root>/<name>`.
+def plan(path: Path, root: Path, scale: float = scaling.WHOLE) -> Plan:
+    """Resolve and check a grid file, and freeze it in `<root>/<name>`, or a share of its seeds and steps beside that.
 
     A grid that was frozen before is frozen anew: runs of cells that are still there keep their results. Raises
     ConfigError for every fault of the files, and if somebody is working on another version of the grid now.
     """
     config, points = load_grid(path)
-    grid = Grid(root.absolute() / config.name)
+    name, seeds = scaling.name_of(config.name, scaling.checked(scale)), scaling.fewer(config.seed_list(), scale)
+    grid = Grid(root.absolute() / name)
     files = _InstanceFiles()
     specs: dict[str, EnvironmentSpec] = {}  # by the section of a config: an environment is looked at once
     cells: dict[str, Cell] = {}
     steps = 0
     for point, data in points:
         label = label_of(point, config.axes())
-        cell, run_steps = _cell(config, point, label, data, f"{path}, cell {label!r}", files, specs)
+        where = f"{path}, cell {label!r}"
+        resolved = scaling.shorter(_resolved(config, label, data, where), scale, where)
+        cell, run_steps = _cell(config, resolved, point, label, where, files, specs)
         if cell.id in cells:
             raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
         cells[cell.id] = cell
-        steps += run_steps * len(config.seed_list())
+        steps += run_steps * len(seeds)
     manifest = Manifest(
-        name=config.name, axes=tuple(config.axes()), cells=_distinct(cells.values()), seeds=config.seed_list(),
+        name=name, axes=tuple(config.axes()), cells=_distinct(cells.values()), seeds=seeds,
         resources=config.resources, retry=config.retry,
-        tracking=settled(config.tracking, config.name),
+        tracking=settled(config.tracking, name),
         baseline=_baseline(path, config, list(cells.values())),
         instances={name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.contents.items())},
-        code=code_digest(), git=git_state(),
+        code=code_digest(), git=git_state(), scale=scale,
     )  # fmt: skip
     before = freeze(grid, manifest, files.contents)
     now, then = ({run.key for run in one.runs()} if one else set[str]() for one in (manifest, before))
@@ -93,16 +98,19 @@ class _InstanceFiles:
         return self._names[id(instances)]
 
 
-def _cell(
-    grid: GridConfig, point: dict[str, Any], label: str, data: dict[str, Any], where: str, files: _InstanceFiles,
-    specs: dict[str, EnvironmentSpec],
-) -> tuple[Cell, int]:  # fmt: skip
-    """A cell, and the environment steps of each of its runs."""
+def _resolved(grid: GridConfig, label: str, data: dict[str, Any], where: str) -> RunConfig:
     for key in ("tracking", "resources", "seed"):  # the grid's own
         data.pop(key, None)
     # The name of a run may become a file's.
     name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
-    config = configs.parse({**data, "name": name}, where)
+    return configs.parse({**data, "name": name}, where)
+
+
+def _cell(
+    grid: GridConfig, config: RunConfig, point: dict[str, Any], label: str, where: str, files: _InstanceFiles,
+    specs: dict[str, EnvironmentSpec],
+) -> tuple[Cell, int]:  # fmt: skip
+    """A cell, and the environment steps of each of its runs."""
     with about(where):
         section = config.env.model_dump_json()
         blueprint = Blueprint.of(config, specs.get(section), can_share=grid.resources.workers == 0)

@@ -44,14 +44,11 @@ def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
     Returns are IQMs over seeds with bands of 95 %, at the steps where any drawn seed was evaluated. Sizes are
     medians over seeds as far as all drawn seeds got, with a thin line for each seed.
     """
-    figure = _figure(15.0, 4.6 + 0.25 * ((len(configurations) - 1) // 3))
+    figure = empty_figure(15.0, 4.6 + 0.25 * ((len(configurations) - 1) // 3))
     test, train, sizes = figure.subplots(1, 3)
     train.sharey(test)
     for number, configuration in enumerate(configurations):
-        style = {
-            "color": COLOURS[number % len(COLOURS)],
-            "linestyle": LINE_STYLES[number // len(COLOURS) % len(LINE_STYLES)],
-        }
+        style = style_of(number)
         label = _legend(configuration)
         _draw_returns(test, *configuration.returns("test"), label, style)
         _draw_returns(train, *configuration.returns("train"), label, style)
@@ -82,16 +79,16 @@ def draw_panels(panels: Sequence[Panel]) -> Figure:
     columns = min(_PANEL_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     longest = max(len(panel.configurations) for panel in panels)
-    figure = _figure(5.0 * columns, (3.6 + 0.24 * longest) * rows)
+    figure = empty_figure(5.0 * columns, (3.6 + 0.24 * longest) * rows)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         if panel.reference is not None:
             style = {"color": "#777777", "linestyle": "--"}
             _draw_returns(axes, *panel.reference.returns("test"), _legend(panel.reference, _PANEL_LABEL), style)
         for number, configuration in enumerate(panel.configurations):
-            style = {"color": COLOURS[number % len(COLOURS)], "linestyle": LINE_STYLES[number // len(COLOURS) % 4]}
+            style = style_of(number)
             _draw_returns(axes, *configuration.returns("test"), _legend(configuration, _PANEL_LABEL), style)
-        _dress(axes, _plain(panel.title), _RETURN_LABEL)
+        _dress(axes, plain(panel.title), _RETURN_LABEL)
         axes.tick_params(labelbottom=True, labelleft=True)
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), frameon=False, fontsize=8)
     for axes in grid.flat[len(panels) :]:
@@ -128,18 +125,18 @@ class HeatMap:
 def draw_heat_map(found: HeatMap, low: float, high: float) -> Figure:
     """One map; `low` and `high` are the ends of the colour scale, shared by maps that are to be compared."""
     n_rows, n_columns = found.means.shape
-    figure = _figure(min(16.0, 2.8 + 1.25 * n_columns), min(16.0, 1.8 + 0.72 * n_rows))
+    figure = empty_figure(min(16.0, 2.8 + 1.25 * n_columns), min(16.0, 1.8 + 0.72 * n_rows))
     axes = figure.subplots()
     colours = colormaps["cividis"].with_extremes(bad="#EEEEEE")
     # Where all values are one, the scale still needs a width.
     image = axes.imshow(found.means, cmap=colours, vmin=low, vmax=max(high, low + 1e-9), aspect="auto")
-    across, down = ([_plain(textwrap.shorten(value, 24, placeholder="…")) for value in values]
+    across, down = ([plain(textwrap.shorten(value, 24, placeholder="…")) for value in values]
                     for values in (found.columns, found.rows))  # fmt: skip
     axes.set_xticks(range(n_columns), across, rotation=90 if sum(map(len, across)) > 9 * n_columns else 0)
     axes.set_yticks(range(n_rows), down)
-    axes.set_xlabel(_plain(found.column_name))
-    axes.set_ylabel(_plain(found.row_name))
-    axes.set_title(_plain(found.title), fontsize=11)
+    axes.set_xlabel(plain(found.column_name))
+    axes.set_ylabel(plain(found.row_name))
+    axes.set_title(plain(found.title), fontsize=11)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
     for row in range(n_rows) if n_rows * n_columns <= MAX_WRITTEN else ():
@@ -159,7 +156,7 @@ def draw_learning_curve(run: Run) -> Figure:
     """
     if not len(run.evaluation_steps):
         raise LedgerError(f"{run.ledger.folder} holds no evaluation yet")
-    figure = _figure(7.5, 6.5)
+    figure = empty_figure(7.5, 6.5)
     returns, sizes = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     for label, measures, colour, marker in (("test", run.test, COLOURS[0], "o"), ("train", run.train, COLOURS[1], "s")):
         marked = marker if len(run.evaluation_steps) <= MAX_MARKED else None
@@ -220,7 +217,7 @@ def draw_curriculum(run: Run) -> Figure:
     order, shares = curriculum_shares(trained, run.instance_ids)
     n, m = len(order), len(trained)
     height, width = -(-n // MAX_ROWS), -(-m // MAX_COLUMNS)
-    figure = _figure(7.5, 5.5)
+    figure = empty_figure(7.5, 5.5)
     axes = figure.subplots()
     colours = LinearSegmentedColormap.from_list("share", ["#FFFFFF", COLOURS[0]])
     image = axes.imshow(
@@ -257,7 +254,7 @@ def draw_contexts(run: Run) -> Figure:
     panels = len(names) + bool(divergences)
     columns = 2 if panels <= 4 else 4
     rows = -(-panels // columns)
-    figure = _figure(4.6 * columns, 3.0 * rows)
+    figure = empty_figure(4.6 * columns, 3.0 * rows)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     means = np.array([contexts.mean(axis=0) for contexts in generated])
     deviations = np.array([contexts.std(axis=0) for contexts in generated])
@@ -286,40 +283,58 @@ def save(figure: Figure, path: Path) -> None:
     atomic_write(path, png(figure))
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as a PNG file."""
+def png(figure: Figure, note: str = "") -> bytes:
+    """The figure as a PNG file; with a note, it is written above everything."""
+    if note:
+        figure.suptitle(plain(note), fontsize=10, color="#B00020")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
     return buffer.getvalue()
 
 
-def _plain(text: str) -> str:
+def style_of(number: int) -> dict[str, Any]:
+    """Colour and line of the number-th curve: neighbours differ in both, to be told apart in grey as well."""
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINE_STYLES[number % len(LINE_STYLES)]}
+
+
+def plain(text: str) -> str:
     """A user's words, which Matplotlib is not to read as mathematics."""
     return text.replace("$", r"\$")
 
 
+def wrapped(label: str, width: int, more: str = "") -> str:
+    """A user's label in at most three lines, for a legend or a title; `more` is put behind it."""
+    words = f"{textwrap.fill(label, width, max_lines=3)}{more}"
+    return plain(f" {words}" if words.startswith("_") else words)  # Matplotlib hides labels that begin so
+
+
 def _legend(configuration: Configuration, width: int = 60) -> str:
-    words = f"{textwrap.fill(configuration.label, width, max_lines=3)} ({_seed_count(configuration)})"
-    return _plain(f" {words}" if words.startswith("_") else words)  # Matplotlib hides labels that begin so
+    return wrapped(configuration.label, width, f" ({_seed_count(configuration)})")
 
 
-def _figure(width: float, height: float) -> Figure:
+def empty_figure(width: float, height: float) -> Figure:
     """An empty white figure, in inches, whose parts keep out of each other's way."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
-def _dress(axes: Axes, title: str, label: str) -> None:
+def dress(axes: Axes, title: str = "", *, over_steps: bool = False) -> None:
+    """What all diagrams have in common. over_steps: the horizontal axis counts environment steps."""
     axes.set_title(title, fontsize=11)
-    axes.set_xlabel(_STEPS_LABEL)
-    axes.set_ylabel(label)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10], integer=True))
-    axes.set_xlim(0, max(1.0, axes.get_xlim()[1]))
+    if over_steps:
+        axes.set_xlabel(_STEPS_LABEL)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10], integer=True))
+        axes.set_xlim(0, max(1.0, axes.get_xlim()[1]))
     axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _dress(axes: Axes, title: str, label: str) -> None:
+    dress(axes, title, over_steps=True)
+    axes.set_ylabel(label)
     if not any(np.size(line.get_xdata()) for line in axes.get_lines()):
         axes.tick_params(labelleft=False, labelbottom=False)
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", va="center", color="#777777")

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from space_dist.config import clean
 from space_dist.errors import ConfigError
+from space_dist.experiment import scaling
 from space_dist.experiment.manifest import Grid, Manifest
+from space_dist.report.curricula import curricula_of, curriculum_sections, inclusion_rows
 from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
 from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, draw_heat_map, draw_panels, png
 from space_dist.report.grid import (
@@ -29,8 +31,10 @@ from space_dist.report.grid import (
     run_folder,
     varying,
 )
+from space_dist.report.instances import instance_sections
 from space_dist.report.load import Configuration
-from space_dist.report.statistics import FEWEST, Interval
+from space_dist.report.measures import Measured, measure_numbers, measure_sections, measured, paired_cells
+from space_dist.report.statistics import FEWEST, Interval, estimate
 from space_dist.report.tables import (
     NONE,
     Value,
@@ -49,6 +53,7 @@ from space_dist.system.files import atomic_write
 
 MAX_DRAWN: Final = 48  # cells with a learning curve
 MAX_LISTED: Final = 100  # failures, remarks
+MAX_ANALYSED: Final = 48  # cells whose instances and curricula are looked at one by one
 _CURVES_PER_PANEL: Final = 6
 _METHOD: Final = tuple(
     " ".join(paragraph.split())
@@ -70,6 +75,11 @@ of the mean where seeds are censored. The ratio is the cell's restricted mean ov
 steps), both up to the smaller budget; its interval is of pairs of seeds, and the threshold is held fixed. Untestable:
 the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound (mean + t s sqrt(1 + 1/n)) of
 one more untrained seed.
+
+Early is the area under the curve of the return on the held-out instances over environment steps, divided by the budget
+(trapezoid; the mean return over training). The worst tenth (CVaR) are the held-out instances of least final return,
+chosen on one half of the evaluation episodes and measured on the other, both ways, and needs evaluation.episodes of two
+or more. Differences are taken seed by seed, with Student's t; p is of the two-sided Wilcoxon signed-rank test.
 
 Curves are IQMs over the finished seeds (while a cell has none, over unfinished ones, which its label says) with the
 same intervals as bands. Steps are real environment steps of training.""".split("\n\n")
@@ -114,29 +124,39 @@ def build_grid_report(
     if reference is None:
         raise ConfigError(f"{grid.manifest_file} names a baseline {chosen!r} that is none of its cells")
     compared = compare(cells, reference, threshold)
+    measures = measured(cells, compared)
+    curricula = curricula_of(cells[:MAX_ANALYSED])
+    note = scaling.in_words(manifest.scale)
 
     summary = _summary(manifest, cells, reference, compared, threshold)
     remarks = _remarks(manifest, cells, compared)
-    finals = _finals(cells, compared)
+    finals = _finals(cells, compared, measures)
     sections = [
         Section("", summary),
         Section("Final return on the held-out instances", rows=finals),
         *_failed(cells),
-        *_curves(cells, reference),
+        *_curves(cells, reference, note),
     ]
     if any(cell.summary.n_finished for cell in cells):
+        names = [_name(*pair) for pair in zip(cells, compared, strict=True)]
+        few = [f"Of {len(cells):,} cells, instances and curricula of the first {MAX_ANALYSED} are looked at."]
         sections += [
             Section("Steps to the threshold", rows=[_steps_row(*pair) for pair in zip(cells, compared, strict=True)]),
-            *_maps(cells),
+            *measure_sections(cells, names, measures),
+            *_maps(cells, note),
             *_pooled(cells),
             Section("Training", rows=[_training_row(cell) for cell in cells]),
+            *([Section("Instances and curricula", few)] if len(cells) > MAX_ANALYSED else []),
+            *curriculum_sections(curricula, note),
+            *instance_sections(cells[:MAX_ANALYSED], note),
         ]
     sections += [Section("Remarks", items=remarks)] if remarks else []
     document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
     markdown = to_markdown(document)
     files = {
         **{picture.file: picture.png for section in document.sections for picture in section.pictures},
-        "cells.csv": to_csv([_numbers(*pair) for pair in zip(cells, compared, strict=True)]).encode(),
+        "cells.csv": to_csv([_numbers(*three) for three in zip(cells, compared, measures, strict=True)]).encode(),
+        **_more_csv({"curves.csv": _curve_rows(cells), "curricula.csv": inclusion_rows(curricula)}),
         "runs.csv": to_csv(_run_numbers(grid, cells)).encode(),
         "report.md": markdown.encode(),
         "report.html": to_html(document).encode(),
@@ -150,6 +170,11 @@ def build_grid_report(
         _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
     ]
     return GridReport(folder, summary, table, remarks, markdown)
+
+
+def _more_csv(tables: Mapping[str, list[dict[str, Value]]]) -> dict[str, bytes]:
+    """Those that have rows."""
+    return {name: to_csv(rows).encode() for name, rows in tables.items() if rows}
 
 
 def _unwritable(folder: Path, error: OSError) -> ConfigError:
@@ -177,6 +202,8 @@ def _summary(
         ]
     every = "All" if done == n_runs else f"{done:,} of"
     sentences = [f"{every} {n_runs:,} runs are finished ({size}){f'; {rest}' if rest else ''}."]
+    if manifest.scale != scaling.WHOLE:
+        sentences.append(f"A grid in small, {scaling.in_words(manifest.scale)}: no evidence for the whole one.")
     level = compared[cells.index(baseline)].threshold
     others = len({cell.task for cell in cells}) > 1
     counterparts = "; in other environments or test sets, its counterpart there" if others else ""
@@ -209,9 +236,11 @@ def _name(cell: CellRuns, comparison: Comparison) -> str:
     return f"{cell.label} (baseline)" if comparison.reference is cell else cell.label
 
 
-def _finals(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[dict[str, str]]:
+def _finals(
+    cells: Sequence[CellRuns], compared: Sequence[Comparison], measures: Sequence[Mapping[str, Measured]]
+) -> list[dict[str, str]]:
     rows = []
-    for cell, comparison in zip(cells, compared, strict=True):
+    for cell, comparison, found in zip(cells, compared, measures, strict=True):
         test, of = cell.summary.test, cell.summary.n_runs
         rows.append(
             {
@@ -222,6 +251,7 @@ def _finals(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[d
                 "mean [95 %]": _with_seeds(interval_text(test.mean), test.n, of),
                 "median [95 %]": _with_seeds(interval_text(test.median), test.n, of),
                 "P(better) [95 %]": _improvement(cell, comparison),
+                **paired_cells(found["final"]),
             }
         )
     return rows
@@ -327,7 +357,7 @@ def _pooled(cells: Sequence[CellRuns]) -> list[Section]:
 # ---- figures --------------------------------------------------------------------------------------------------------
 
 
-def _curves(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Section]:
+def _curves(cells: Sequence[CellRuns], baseline: CellRuns, note: str) -> list[Section]:
     drawn = [cell for cell in cells if cell.configuration.drawn]
     text = []
     if len(drawn) > MAX_DRAWN:
@@ -342,7 +372,7 @@ def _curves(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Section]:
     else:
         figure = draw_panels(_panels(drawn, baseline))
         caption = "Test return over environment steps (IQM over seeds, 95 % interval); grey: the baseline"
-    return [Section("Learning curves", text, pictures=[Picture("curves.png", caption, png(figure))])]
+    return [Section("Learning curves", text, pictures=[Picture("curves.png", caption, png(figure, note))])]
 
 
 def _descending(cell: CellRuns) -> float:
@@ -366,7 +396,7 @@ def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
             for place, group in groups.items() if curves(group)]  # fmt: skip
 
 
-def _maps(cells: Sequence[CellRuns]) -> list[Section]:
+def _maps(cells: Sequence[CellRuns], note: str) -> list[Section]:
     maps = [found for found in heat_maps(cells) if not all(math.isnan(value) for value in found.means.flat)]
     shown = [value for found in maps for value in found.means.flat if not math.isnan(value)]
     text = "Final test return: mean ± standard deviation over the finished seeds, as in the paper's Table 1."
@@ -374,7 +404,7 @@ def _maps(cells: Sequence[CellRuns]) -> list[Section]:
     for number, found in enumerate(maps, start=1):
         title = "Two parameters" + (f": {found.title}" if found.title else "")
         picture = Picture(f"heat_map_{number}.png", f"{found.column_name} and {found.row_name}: mean final test return",
-                          png(draw_heat_map(found, min(shown), max(shown))))  # fmt: skip
+                          png(draw_heat_map(found, min(shown), max(shown)), note))  # fmt: skip
         sections.append(Section(title, [text], _map_rows(found), pictures=[picture]))
     return sections
 
@@ -391,7 +421,7 @@ def _map_rows(found: HeatMap) -> list[dict[str, str]]:
 # ---- numbers in full precision --------------------------------------------------------------------------------------
 
 
-def _numbers(cell: CellRuns, comparison: Comparison) -> dict[str, Value]:
+def _numbers(cell: CellRuns, comparison: Comparison, measures: Mapping[str, Measured]) -> dict[str, Value]:
     reach, none = comparison.reach, Interval(math.nan)
     reference = comparison.reference
     return {
@@ -408,7 +438,20 @@ def _numbers(cell: CellRuns, comparison: Comparison) -> dict[str, Value]:
         **interval_numbers("steps_ratio", comparison.ratio or none),
         "steps_ratio_pairs": comparison.pairs,
         "steps_untestable": comparison.untestable,
+        **measure_numbers(measures),
     }
+
+
+def _curve_rows(cells: Sequence[CellRuns]) -> list[dict[str, Value]]:
+    """The learning curves that are drawn: a row a cell and step."""
+    rows: list[dict[str, Value]] = []
+    for cell in cells:
+        steps, returns = cell.configuration.returns("test")
+        for step, values in zip(steps.tolist(), returns.T, strict=True):
+            found = estimate(values).iqm
+            rows.append({"cell": cell.cell.id, "label": cell.label, "steps": step, "seeds": len(values),
+                         **interval_numbers("test_return_iqm", found)})  # fmt: skip
+    return rows
 
 
 def _run_numbers(grid: Grid, cells: Sequence[CellRuns]) -> list[dict[str, Value]]:

@@ -18,7 +18,7 @@ from ruamel.yaml.error import YAMLError
 
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.ledger import CURRICULUM, METRICS, Ledger, Row, Status
+from space_dist.ledger import CURRICULUM, METRICS, VALUES, Ledger, Row, Status
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -71,6 +71,41 @@ class Run:
     def features(self) -> tuple[str, ...]:
         """Of a context, in the order of the instance files."""
         return tuple(name for name in _header(self.ledger) if name != "id")
+
+    @property
+    def instance_contexts(self) -> FloatArray | None:
+        """`(n, d)` the contexts of the training instances by id, scaled from their bounds to [0, 1]; read anew.
+
+        None where the ledger does not hold the bounds: the run was begun by an earlier version, or its set is too large
+        for start values to be kept.
+        """
+        found = _contexts_of(_read_instances(self.ledger, "train"))
+        rows = _rows(self.ledger, VALUES)[:1]
+        if found is None or not rows or "low" not in rows[0]:
+            return None
+        with _readable(self.ledger):
+            low, high = (np.array(rows[0][end], dtype=np.float64) for end in ("low", "high"))
+            width = np.where(high > low, high - low, 1.0)
+            return np.asarray((found[:, : len(low)] - low) / width)
+
+    def instance_returns(self, split: Split) -> FloatArray:
+        """`(k, n)` each instance's mean return in each evaluation, instances by id; read anew.
+
+        Raises LedgerError if an evaluation has none, or not as many as the others.
+        """
+        rows = [row for row in _rows(self.ledger, METRICS) if row.get("kind") == "evaluation"]
+        with _readable(self.ledger):
+            return np.array([row[split]["returns"] for row in rows], dtype=np.float64)
+
+    def final_halves(self, split: Split) -> FloatArray | None:
+        """`(2, n)` each instance's mean return over one half and the other of its last evaluation's episodes.
+
+        Read anew. None where instances were evaluated on one episode each, or nothing was evaluated.
+        """
+        rows = [row for row in _rows(self.ledger, METRICS) if row.get("kind") == "evaluation"]
+        with _readable(self.ledger):
+            found = rows[-1][split].get("halves") if rows else None
+            return None if found is None else np.array(found, dtype=np.float64).reshape(2, -1)
 
     @property
     def contexts(self) -> tuple[FloatArray, ...]:
@@ -292,6 +327,19 @@ def _ids_of(text: str) -> IntArray | None:
         column = [name.strip() for name in header.split(",")].index("id")
         return np.array(sorted(int(line.split(",")[column]) for line in lines if line.strip()), dtype=np.int64)
     except (ValueError, IndexError, OverflowError):
+        return None
+
+
+@functools.lru_cache(maxsize=8)
+def _contexts_of(text: str) -> FloatArray | None:
+    """`(n, d)` the columns but the id's, rows by id; None if they are not all numbers."""
+    header, *lines = text.splitlines() or [""]
+    names = [name.strip() for name in header.split(",")]
+    try:
+        table = np.array([[float(cell) for cell in line.split(",")] for line in lines if line.strip()])
+        place = names.index("id")
+        return np.delete(table[np.argsort(table[:, place], kind="stable")], place, axis=1)
+    except (ValueError, IndexError):
         return None
 
 

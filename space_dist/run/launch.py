@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from space_dist import arithmetic
 from space_dist import config as configs
-from space_dist.config import RunConfig, TrackingConfig
+from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import (
@@ -115,6 +115,17 @@ class ActiveRun:
             status=self.status, stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
 
+    def mirror(self) -> None:
+        """Begin to keep what the config's tracking asks for. A run goes on without, and says so at its end."""
+        tracking, folder = self.blueprint.config.tracking, self.outcome.ledger.folder
+        if not (tracking.anywhere and tracking.live):
+            return
+        try:
+            self.pusher = Pusher(tracking, folder, folder / "tracking.log")
+        except OSError as error:
+            warning = f"nothing was mirrored: {in_words(error)}. `space-dist sync {folder}` does it later"
+            self.outcome = replace(self.outcome, tracking_warning=warning)
+
     def raise_if_stopped(self) -> None:
         """Raise Interrupted, before the first round, if it was asked to stop."""
         _stop_if_asked(self.writer, self.stop)
@@ -161,7 +172,7 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
             yield active
             return
         stop.watch(ledger.stop_file, blueprint.config.resources.grace_seconds)
-        active.pusher = _start_pusher(blueprint.config.tracking, ledger)
+        active.mirror()
         with _logging_to(ledger.log), _failures_noted(writer):
             if status.fingerprint_changed:
                 log.warning(
@@ -483,13 +494,3 @@ def _logging_to(path: Path) -> Iterator[None]:
     finally:
         log.removeHandler(handler)
         handler.close()
-
-
-def _start_pusher(tracking: TrackingConfig, ledger: Ledger) -> Pusher | None:
-    if not (tracking.anywhere and tracking.live):
-        return None
-    try:
-        return Pusher(tracking, ledger.folder, ledger.folder / "tracking.log")
-    except OSError as error:
-        log.warning("nothing is mirrored while the run trains: %s. `space-dist sync` can do it later", in_words(error))
-        return None

@@ -58,12 +58,18 @@ def iteration_row(run: RunState, *, complete: bool, overlap: bool) -> Row:
 
 
 def summary(outcomes: Outcomes, instances: int, episodes: int) -> dict[str, Any]:
-    """Means over a split, and each instance's mean return in id order; over all policies, where there are several."""
+    """Means over a split, and each instance's mean return in id order; over all policies, where there are several.
+
+    With several episodes an instance, its mean over the first, third, ... and over the others is there as well, so that
+    instances can be chosen by one half and measured by the other.
+    """
     returns = checked(outcomes.returns, "returns")
+    each = returns.reshape(-1, instances, episodes)
     return {
         "return": float(returns.mean()),
         "discounted_return": float(outcomes.discounted_returns.mean()),
         "length": float(outcomes.lengths.mean()),
         "success": None if np.isnan(outcomes.success).any() else float(outcomes.success.mean()),
-        "returns": returns.reshape(-1, instances, episodes).mean(axis=(0, 2)).tolist(),
+        "returns": each.mean(axis=(0, 2)).tolist(),
+        **({"halves": [each[:, :, half::2].mean(axis=(0, 2)).tolist() for half in (0, 1)]} if episodes > 1 else {}),
     }

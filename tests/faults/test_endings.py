@@ -142,6 +142,19 @@ def test_a_run_folder_with_a_link_is_refused_in_a_sentence(name: str, tmp_path: 
     assert (tmp_path / "precious").read_text() == "precious"
 
 
+def test_what_the_mirror_says_is_not_written_through_a_link(tmp_path: Path) -> None:
+    """A run is done whatever becomes of its mirror; the file that is linked stays as it was."""
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "tracking.log").symlink_to(tmp_path / "precious")
+    data = faulty(tmp_path, "none").model_dump(mode="json") | {"tracking": {"uri": f"sqlite:///{tmp_path}/mlflow.db"}}
+    outcome = launch(configs.parse(data, "test"), tmp_path / "run", resume=True, stop=StopRequests())
+    assert outcome.ledger.status().state == "done"
+    assert "tracking.log is a link" in str(outcome.tracking_warning)
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert not (tmp_path / "mlflow.db").exists()
+
+
 @pytest.mark.parametrize("shell", [">/dev/full", "| head -0", ">&- 2>&-"])
 def test_work_that_is_done_ends_with_0_whatever_became_of_its_output(shell: str, tmp_path: Path) -> None:
     done = train(tmp_path, "none", shell=shell)

@@ -1,0 +1,53 @@
+"""A grid in small: fewer seeds and fewer steps, so that a large one can be tried, and says everywhere that it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from space_dist import config as configs
+from space_dist.config import RunConfig
+from space_dist.errors import ConfigError
+
+WHOLE = 1.0
+
+
+def checked(scale: float) -> float:
+    """A share of seeds and steps. Raises ConfigError unless it is above 0 and at most 1."""
+    if not 0.0 < scale <= WHOLE:  # NaN neither
+        raise ConfigError(f"--scale {scale:g}: a share of the grid's seeds and steps, above 0 and at most 1")
+    return scale
+
+
+def name_of(name: str, scale: float) -> str:
+    """The name of a grid in small: never that of the whole one, whose folder and results are others."""
+    return name if scale == WHOLE else f"{name}-scale-{scale:g}"
+
+
+def fewer(seeds: Sequence[int], scale: float) -> tuple[int, ...]:
+    """The first of the seeds: their share, rounded up."""
+    return tuple(seeds[: math.ceil(len(seeds) * scale - 1e-9)])  # 0.1 * 30 is a little more than 3
+
+
+def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
+    """A run of that share of the budget, at least one update of it, evaluated as often as the whole one.
+
+    All else stays, so schedules over the budget are steeper, and a set that grows by one gets less far. `where` names
+    the config in errors. Raises ConfigError if the result is no config.
+    """
+    if scale == WHOLE:
+        return config
+    data: dict[str, Any] = config.model_dump(mode="json")
+    budget, evaluation = data["budget"], data["evaluation"]
+    budget["steps"] = max(math.ceil(budget["steps"] * scale - 1e-6), data["learner"].get("n_steps") or 1)
+    if budget["episodes"] is not None:
+        budget["episodes"] = math.ceil(budget["episodes"] * scale - 1e-6)
+    if isinstance(evaluation["every_steps"], int):
+        evaluation["every_steps"] = math.ceil(evaluation["every_steps"] * scale - 1e-6)
+    return configs.parse(data, where)
+
+
+def in_words(scale: float) -> str:
+    """For reports and figures; empty for a whole grid."""
+    return "" if scale == WHOLE else f"scale {scale:g}: {scale:.3g} of the seeds and of the steps of the whole grid"

@@ -1,0 +1,243 @@
+"""Curricula compared: which instances come when, how alike seeds and cells are in that, and how far the set moves.
+
+For cells that train on sets of instances, by the definitions of `analyses` (the SPaCE paper's appendix).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from space_dist.report.analyses import (
+    agreement,
+    consistency,
+    feature_means,
+    feature_rank_correlations,
+    features_by_rank,
+    frequencies,
+    inclusion_order,
+    rank_changes,
+    share_below,
+    shifts,
+    weighted_frequencies,
+)
+from space_dist.report.analysis_figures import FeatureCurves, draw_features, draw_frequencies
+from space_dist.report.document import Picture, Section
+from space_dist.report.figures import png
+from space_dist.report.grid import CellRuns
+from space_dist.report.load import FloatArray, IntArray, Run
+from space_dist.report.statistics import Interval, estimate
+from space_dist.report.tables import NONE, Value, interval_text, number_text
+
+MAX_DRAWN: Final = 8  # cells in a figure of curricula
+MAX_AGREEING: Final = 12  # cells of the table of agreement
+
+
+@dataclass(frozen=True, eq=False)
+class CellCurricula:
+    """The curricula of a cell's s finished runs over its n training instances, all of one set.
+
+    orders `(s, n)` first iterations; frequencies, weighted `(n,)` means over runs; below `(s,)` share of the steps
+    spent on less than half of the instances. shift_means, shift_peaks, jaccards `(s,)`: NaN where a set never moved, or
+    bounds are unknown. features: their names; by_rank `(n, d)`, correlations `(d,)`, and over steps: None where bounds
+    are unknown.
+    """
+
+    cell: CellRuns
+    ids: IntArray
+    orders: IntArray
+    frequencies: FloatArray
+    weighted: FloatArray
+    changes: FloatArray
+    below: FloatArray
+    shift_means: FloatArray
+    shift_peaks: FloatArray
+    jaccards: FloatArray
+    features: tuple[str, ...]
+    contexts: FloatArray | None
+    over_steps: FeatureCurves | None
+
+    @property
+    def label(self) -> str:
+        """The cell's."""
+        return self.cell.label
+
+
+def curricula_of(cells: Sequence[CellRuns]) -> list[CellCurricula]:
+    """Those of the cells whose finished runs trained on sets; not of drawn or generated contexts."""
+    return [found for cell in cells if (found := _curricula_of(cell)) is not None]
+
+
+def _curricula_of(cell: CellRuns) -> CellCurricula | None:
+    runs = [run for run in cell.configuration.finished if len(run.set_sizes)]
+    if not runs or any(run.generates_contexts for run in runs) or not _trains_on_sets(cell):
+        return None
+    ids = runs[0].instance_ids
+    contexts = runs[0].instance_contexts
+    orders, each, weighted, changes, below, moved, curves = [], [], [], [], [], [], []
+    for run in runs:
+        trained = run.trained
+        order, frequency = inclusion_order(trained, ids), frequencies(trained, ids)
+        weight = weighted_frequencies(frequency, order)
+        orders.append(order)
+        each.append(frequency)
+        weighted.append(weight)
+        changes.append(float(rank_changes(frequency, weight)))
+        below.append(share_below(trained, ids, run.iteration_ends))
+        if contexts is not None:
+            moved.append(_movement(run, trained, contexts))
+            curves.append((run.iteration_ends, feature_means(trained, ids, contexts)))
+    movement = np.array(moved or [(math.nan,) * 3] * len(runs))
+    return CellCurricula(
+        cell, ids, np.array(orders), np.mean(each, axis=0), np.mean(weighted, axis=0), np.array(changes),
+        np.array(below), movement[:, 0], movement[:, 1], movement[:, 2],
+        features=runs[0].features[: 0 if contexts is None else contexts.shape[1]], contexts=contexts,
+        over_steps=curves or None,
+    )  # fmt: skip
+
+
+def _trains_on_sets(cell: CellRuns) -> bool:
+    """Whether the ledger's `trained` are the sets themselves, and not the draws whose episodes ended."""
+    return cell.cell.config["curriculum"]["kind"] in (
+        "space",
+        "cspace",
+        "random_growth",
+        "manual",
+        "round_robin",
+        "fixed",
+    )
+
+
+def _movement(run: Run, trained: Sequence[IntArray], contexts: FloatArray) -> tuple[float, float, float]:
+    found = shifts(trained, run.instance_ids, contexts)
+    if not len(found.steps):
+        return math.nan, math.nan, math.nan
+    return float(found.steps.mean()), float(found.steps.max()), float(found.jaccard.mean())
+
+
+def curriculum_sections(found: Sequence[CellCurricula], note: str) -> list[Section]:
+    """Tables and figures of the cells whose sets change; nothing where none does. `note` is written on figures."""
+    growing = [one for one in found if len(np.unique(one.orders)) > 1]
+    if not growing:
+        return []
+    return [_table(growing), *_agreement(growing), *_figures(growing, note)]
+
+
+def _table(found: Sequence[CellCurricula]) -> Section:
+    rows = []
+    for one in found:
+        alike = consistency(one.orders)
+        rows.append(
+            {
+                "cell": one.label,
+                "seeds": str(len(one.orders)),
+                "tau with the other seeds: mean, least": _mean_and_least(alike.with_others),
+                "tau of pairs: mean": _mean(alike.pairs, 3),
+                "set moves an iteration: mean, most": _movement_text(one),
+                "Jaccard distance: mean": _mean(one.jaccards, 3),
+                "instances that change places by weight": _mean(one.changes, 1),
+                "steps on less than half of the set [95 %]": _percent(estimate(one.below).mean.within(0.0, 1.0)),
+            }
+        )
+    text = (
+        "Order: the iteration in which an instance is first in the set. Tau: Kendall's tau-b, of a seed's order with "
+        "the mean of the others', and of all pairs of seeds. The set's movement: distance of its mean context from one "
+        "iteration to the next, in % of the diagonal of the bounds, until the set is first whole. Places by weight: "
+        "instances that stand elsewhere when frequencies are weighted by the rank of inclusion."
+    )
+    return Section("Curricula", [text], rows)
+
+
+def _agreement(found: Sequence[CellCurricula]) -> list[Section]:
+    """How alike the mean orders of two cells are, where both train on the same instances."""
+    rows = []
+    shown = found[:MAX_AGREEING]
+    for one in shown:
+        row = {"cell": one.label}
+        for other in shown:
+            alike = np.array_equal(one.ids, other.ids) and _same(one.contexts, other.contexts)
+            row[other.label] = f"{agreement(one.orders, other.orders):.2f}" if alike else NONE
+        rows.append(row)
+    if len(shown) < 2:
+        return []
+    text = "Kendall's tau-b between the mean orders of inclusion of two cells."
+    return [Section("Agreement between curricula", [text], rows)]
+
+
+def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
+    return one is None or other is None or np.array_equal(one, other)
+
+
+def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
+    drawn = found[:MAX_DRAWN]
+    text = [] if len(drawn) == len(found) else [f"The first {MAX_DRAWN} of {len(found):,} cells."]
+    pictures = [
+        Picture(
+            "frequencies.png",
+            "Share of iterations that an instance was in the set: as it is, and weighted by the rank of inclusion",
+            png(draw_frequencies([(one.label, _ranked(one), one.frequencies, one.weighted) for one in drawn]), note),
+        )
+    ]
+    known = [one for one in drawn if one.contexts is not None]
+    if known:
+        curves = [(one.label, one.over_steps, features_by_rank(one.orders, one.contexts))
+                  for one in known if one.over_steps is not None and one.contexts is not None]  # fmt: skip
+        caption = "Context features, scaled from their bounds: mean of the set, and of the instance at each rank"
+        pictures.append(Picture("context_features.png", caption, png(draw_features(known[0].features, curves), note)))
+    rows = [
+        {"cell": one.label, **{name: number_text(float(tau), 2) for name, tau in
+                               zip(one.features, feature_rank_correlations(one.orders, one.contexts), strict=True)}}
+        for one in known if one.contexts is not None and one.features == known[0].features
+    ]  # fmt: skip
+    text += ["Table: Kendall's tau-b between an instance's mean order of inclusion and each feature."] if rows else []
+    return [Section("Instances and their contexts", text, rows, pictures=pictures)]
+
+
+def _ranked(one: CellCurricula) -> IntArray:
+    """Places of instances, by mean order of inclusion."""
+    return np.argsort(one.orders.mean(axis=0), kind="stable")
+
+
+def inclusion_rows(found: Sequence[CellCurricula]) -> list[dict[str, Value]]:
+    """For CSV: a row a cell and instance."""
+    return [row for one in found for row in _instance_rows(one)]
+
+
+def _instance_rows(one: CellCurricula) -> list[dict[str, Value]]:
+    mean_order = one.orders.mean(axis=0)
+    return [
+        {
+            "cell": one.cell.cell.id, "label": one.label, "instance": int(identity), "seeds": len(one.orders),
+            "mean_order_of_inclusion": float(mean_order[place]), "frequency": float(one.frequencies[place]),
+            "weighted_frequency": float(one.weighted[place]),
+        }
+        for place, identity in enumerate(one.ids)
+    ]  # fmt: skip
+
+
+# ---- texts ----------------------------------------------------------------------------------------------------------
+
+
+def _mean(values: FloatArray, decimals: int) -> str:
+    return NONE if not len(values) or np.isnan(values).any() else number_text(float(values.mean()), decimals)
+
+
+def _mean_and_least(values: FloatArray) -> str:
+    return NONE if not len(values) or np.isnan(values).any() else f"{values.mean():.3f}, {values.min():.3f}"
+
+
+def _movement_text(one: CellCurricula) -> str:
+    if np.isnan(one.shift_means).any():
+        return NONE
+    return f"{100.0 * one.shift_means.mean():.1f} %, {100.0 * one.shift_peaks.max():.1f} %"
+
+
+def _percent(found: Interval) -> str:
+    if math.isnan(found.value):
+        return NONE
+    low, high = (None if end is None else 100.0 * end for end in (found.low, found.high))
+    return f"{interval_text(Interval(100.0 * found.value, low, high), 1)} %"

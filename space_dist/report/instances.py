@@ -1,0 +1,100 @@
+"""What becomes of each held-out instance: performance profiles, curves, and what is forgotten again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from space_dist.errors import LedgerError
+from space_dist.report.analysis_figures import draw_instances, draw_profiles
+from space_dist.report.document import Picture, Section
+from space_dist.report.figures import png
+from space_dist.report.grid import CellRuns
+from space_dist.report.load import FloatArray, IntArray, Run
+from space_dist.report.outcomes import forgotten, span
+from space_dist.report.statistics import estimate
+from space_dist.report.tables import interval_text
+
+SHARES: Final = (0.05, 0.1, 0.2)  # of the range of returns: by so much a return must rise, and fall again
+FEWEST: Final = 5  # evaluations that forgetting can be told from
+MAX_PANELS: Final = 12  # cells with a diagram of their own
+MAX_PROFILES: Final = 12
+
+Curves = Mapping[str, Sequence[tuple[IntArray, FloatArray]]]
+"""By cell: of each finished run `(k,)` steps and `(k, n)` returns of the n held-out instances."""
+
+
+def instance_sections(cells: Sequence[CellRuns], note: str) -> list[Section]:
+    """Profiles, curves and forgetting, of the cells that have a finished run; `note` is written on figures."""
+    curves = {cell.cell.id: [_curve(run) for run in cell.configuration.finished if run.evaluated_at_end]
+              for cell in cells}  # fmt: skip
+    cells = [cell for cell in cells if curves[cell.cell.id]]
+    if not cells:
+        return []
+    return [*_profiles(cells, curves, note), _every_instance(cells, curves, note), *_forgetting(cells, curves)]
+
+
+def _curve(run: Run) -> tuple[IntArray, FloatArray]:
+    returns = run.instance_returns("test")
+    if len(returns) != len(run.evaluation_steps):
+        raise LedgerError(f"{run.ledger.folder} has evaluations that this version cannot read")
+    return run.evaluation_steps, returns
+
+
+def _profiles(cells: Sequence[CellRuns], curves: Curves, note: str) -> list[Section]:
+    sections = []
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
+    for number, task in enumerate(tasks, start=1):
+        drawn = [cell for cell in cells if cell.task == task][:MAX_PROFILES]
+        scores = [np.concatenate([returns[-1] for _, returns in curves[cell.cell.id]]) for cell in drawn]
+        figure = draw_profiles([cell.label for cell in drawn], scores)
+        caption = "Share of runs × held-out instances whose final return is above tau (Agarwal et al. 2021)"
+        name = "profiles.png" if len(tasks) == 1 else f"profiles_{number}.png"
+        title = "Performance profiles" + (f": environment and test set of {drawn[0].label}" if len(tasks) > 1 else "")
+        sections.append(Section(title, pictures=[Picture(name, caption, png(figure, note))]))
+    return sections
+
+
+def _every_instance(cells: Sequence[CellRuns], curves: Curves, note: str) -> Section:
+    drawn = cells[:MAX_PANELS]
+    text = [] if len(drawn) == len(cells) else [f"The first {MAX_PANELS} of {len(cells):,} cells."]
+    figure = draw_instances([cell.label for cell in drawn], [_mean_curve(curves[cell.cell.id]) for cell in drawn])
+    caption = (
+        "Return of each held-out instance over environment steps, mean over seeds; black: tenths and median of them"
+    )
+    return Section("Every held-out instance", text, pictures=[Picture("instances.png", caption, png(figure, note))])
+
+
+def _mean_curve(curves: Sequence[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
+    """Mean over runs, at every step at which one was evaluated; between its evaluations a run's last one counts."""
+    steps = np.unique(np.concatenate([own for own, _ in curves]))
+    steps = steps[steps >= max(own[0] for own, _ in curves)]
+    each = [returns[np.searchsorted(own, steps, side="right") - 1] for own, returns in curves]
+    return steps, np.asarray(np.mean(each, axis=0))
+
+
+def _forgetting(cells: Sequence[CellRuns], curves: Curves) -> list[Section]:
+    """How many instances fall again, by at least a share of the range of all returns of the task."""
+    rows = []
+    for cell in cells:
+        own = [returns for _, returns in curves[cell.cell.id]]
+        if min(len(returns) for returns in own) < FEWEST:
+            continue
+        whole = span([returns for other in cells if other.task == cell.task for _, returns in curves[other.cell.id]])
+        row = {"cell": cell.label, "held-out instances": f"{own[0].shape[1]:,}"}
+        for share in SHARES:
+            counts = np.array([forgotten(returns, share * whole).sum() for returns in own], dtype=np.float64)
+            found = estimate(counts).mean
+            row[f"fall by {100 * share:g} % of the range, mean [95 %]"] = interval_text(
+                found.within(0.0, own[0].shape[1]), 1
+            )
+        rows.append(row)
+    if not rows:
+        return []
+    text = (
+        "Instances whose return, smoothed over five evaluations, rises by at least that share of the range of all "
+        "returns here, and ends at least as much, and at least two standard errors, below its peak; per run."
+    )
+    return [Section("Forgetting", [text], rows)]
