@@ -124,9 +124,9 @@ def test_a_constant_order_agrees_with_none():
     assert np.isnan(alike.with_others).tolist() == [True, True]
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_single_instance_has_no_order():
-    with np.errstate(all="raise"):
-        assert np.isnan(consistency(np.array([[1], [1]])).pairs).all()
+    assert np.isnan(consistency(np.array([[1], [1]])).pairs).tolist() == [True]
 
 
 def test_methods_agree_by_their_mean_orders():
@@ -384,7 +384,8 @@ def test_area_of_what_diverged_and_of_nonsense():
     assert np.isnan(area(ints(0, 10), floats(1, np.nan), 10))
     for steps, values, budget, message in (
         ([], [], 1, "0 steps of 0 evaluations"), ([0, 1], [1], 1, "2 steps of 1"), ([0, 0], [1, 1], 1, "do not ascend"),
-        ([0, 2, 1], [1, 1, 1], 1, "do not ascend"), ([0], [1], 0, "budget is 0"),
+        ([0, 2, 1], [1, 1, 1], 1, "do not ascend"), ([-1, 2], [1, 1], 1, "do not ascend from 0"),
+        ([0], [1], 0, "budget is 0"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             area(ints(*steps), floats(*values), budget)
@@ -396,6 +397,7 @@ def test_paired_difference_of_three_seeds():
     assert (found.n, found.mean.value, found.p) == (3, 2, 0.25)  # 2 of the 2^3 signs are as extreme
     assert (found.mean.low, found.mean.high) == pytest.approx((-0.484138, 4.484138), abs=1e-6)
     assert paired_difference(floats(1, 2, 3), floats(2, 4, 6)).mean.value == -2
+    assert paired_difference(floats(1, 2, 3, 4, 10), np.zeros(5)).mean.value == 4  # of all, not of the middle
 
 
 @pytest.mark.parametrize(
@@ -404,6 +406,7 @@ def test_paired_difference_of_three_seeds():
         ([1, 2, 3, 4, 5], 2 / 32),
         ([-1, 2, 3, 4], 4 / 16),  # ranks 1 2 3 4: sums of positive ones 10 and 9, and as many below
         ([-1, 1, 2, 3], 6 / 16),  # ranks 1.5 1.5 3 4: 10, and 8.5 twice
+        ([-1, 1, 1], 1),  # ranks 2 2 2: 6 once and 4 thrice, half of all; as if untied, 6 of 8
         ([0, 1, 2, 3], 2 / 8),  # the 0 is left out
         ([0, 0, 1], 1),
         ([1] * 13, 2 / 2**13),
@@ -416,6 +419,7 @@ def test_p_values_are_exact(differences: list[float], p: float):
     assert paired_difference(theirs + floats(*differences), theirs).p == pytest.approx(p)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("differences", [[1], [1, 2], [0, 0, 0, 0], [1, 2, 3, np.nan]])
 def test_no_p_value_below_three_pairs_without_differences_and_where_one_is_missing(differences: list[float]):
     found = paired_difference(floats(*differences), np.zeros(len(differences)))
