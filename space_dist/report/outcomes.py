@@ -107,16 +107,15 @@ def area(steps: IntArray, values: FloatArray, budget: int) -> float:
     `steps` `(k,)` are real environment steps, `values` `(k,)` the returns measured at them; straight lines between.
     The first value holds before its step, the last one behind its own; where evaluations lie behind the budget, the
     line to the first of them is followed as far as the budget. Raises ValueError without evaluations, if there are not
-    as many of both, for steps that do not ascend, and for a budget that is not positive.
+    as many of both, for steps that do not ascend from 0, and for a budget that is not positive.
     """
     if not len(steps) or len(steps) != len(values):
         raise ValueError(f"{len(steps)} steps of {len(values)} evaluations")
-    if (np.diff(steps) <= 0).any():
-        raise ValueError("the steps of the evaluations do not ascend")
+    if (np.diff(steps, prepend=-1) <= 0).any():
+        raise ValueError("the steps of the evaluations do not ascend from 0")
     if budget <= 0:
         raise ValueError(f"the budget is {budget}, and not positive")
-    inside = steps[(steps > 0) & (steps < budget)]
-    corners = np.concatenate(([0], inside, [budget]))
+    corners = np.concatenate(([0], steps[steps < budget], [budget]))
     return float(np.trapezoid(np.interp(corners, steps, values), corners) / budget)
 
 
@@ -134,7 +133,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> PairedDifference:
     differences = ours - theirs
     (centre,) = intervals([differences], "mean")
     moved = differences[differences != 0.0]
-    if n < FEWEST or not len(moved) or np.isnan(moved).any():
+    if n < FEWEST or not len(moved):
         return PairedDifference(centre, np.nan, n)
     return PairedDifference(centre, float(stats.wilcoxon(moved, method="auto").pvalue), n)
 
