@@ -49,13 +49,14 @@ START = (-10.0, -8.0, -6.0, -4.0)  # returns at steps 0 to 3,000; the fifth, at 
 
 def make_grid(
     folder: Path, points: Sequence[Mapping[str, Any]], *, n_seeds: int = 3, baseline: int = 0,
-    labels: Sequence[str] | None = None, code: str = "unknown",
+    labels: Sequence[str] | None = None, code: str = "unknown", kind: str | None = None,
 ) -> Grid:  # fmt: skip
     """A frozen grid of 4,000 steps a run, none of which has begun."""
     cells = []
     for number, point in enumerate(points):
         env = {"id": point.get("env.id", "space_dist/PointMass-v0")}
         config = {"env": env, "instances": {"train": "a.csv", "test": "b.csv"}, "budget": {"steps": 4000}}
+        config |= {} if kind is None else {"curriculum": {"kind": kind}}
         label = " ".join(f"{key}={value}" for key, value in point.items()) if labels is None else labels[number]
         cells.append(Cell(hashlib.sha256(str(number).encode()).hexdigest()[:12], label, point, config))
     axes = tuple(dict.fromkeys(key for point in points for key in point))
