@@ -17,6 +17,7 @@ from space_dist.api.grids import run_grid
 from space_dist.experiment.manifest import Grid
 from space_dist.ledger import CURRICULUM, METRICS, VALUES, Checkpoint, Ledger, RunWriter
 from space_dist.report import build_grid_report, load_run
+from space_dist.report.released import counted
 from space_dist.rollout import Outcomes
 from space_dist.run.rows import summary
 from tests.grids import TINY, write_grid, write_line_instances
@@ -44,7 +45,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def finish(
     grid: Grid, cell: int, seed: int, trained: Sequence[Sequence[int]], returns: Sequence[Sequence[float]],
-    halves: Sequence[Sequence[float]] | None = None,
+    halves: Sequence[Sequence[float]] | None = None, legacy: bool = False,
 ) -> None:  # fmt: skip
     """A done run of iterations of 1,000 steps, after each of which four instances had these returns.
 
@@ -64,6 +65,7 @@ def finish(
             split: dict[str, Any] = {
                 "return": float(np.mean(each)), "discounted_return": 0.0, "length": 1.0, "success": None,
                 "returns": list(each), **({"halves": [list(half) for half in halves]} if halves else {}),
+                **({"legacy_return": float(number)} if legacy else {}),
             }  # fmt: skip
             writer.append(METRICS, {"kind": "evaluation", **position, "train": split, "test": split})
         steps = 1000 * (len(returns) - 1)
@@ -112,7 +114,7 @@ def test_early_late_and_the_worst_tenth(report: Path) -> None:
 
 def test_orders_of_inclusion_are_those_of_the_ledgers(report: Path) -> None:
     """(3, 2, 1, 3) once and (4, 4, 1, 2) twice; of four iterations each was in 2, 3, 4, 2 and in 1, 1, 4, 3 of them."""
-    found = rows(report / "curricula.csv")[4:]
+    found = rows(report / "inclusion.csv")[4:]
     assert [float(row["mean_order_of_inclusion"]) for row in found] == pytest.approx([11 / 3, 10 / 3, 1.0, 7 / 3])
     assert [float(row["frequency"]) for row in found] == pytest.approx([4 / 12, 5 / 12, 1.0, 8 / 12])
     # Ranks 3.5, 2, 1, 3.5 weigh 3/8, 3/4, 1, 3/8; ranks 3.5, 3.5, 1, 2 weigh 3/8, 3/8, 1, 3/4.
@@ -184,6 +186,19 @@ def test_both_halves_of_an_evaluation_are_kept() -> None:
     assert "halves" not in summary(outcomes, instances=10, episodes=1)
 
 
+def test_steps_as_the_released_code_counts_them(tmp_path: Path) -> None:
+    """Sets of 1, 2, 4 and 4 instances: 100, 300, 700 and 1,100 steps where 1,000 to 4,000 were taken."""
+    made = make_grid(tmp_path / "grid", [{"kappa": 1}], n_seeds=1, kind="space")
+    finish(made, 0, 0, EARLY, curve(0, 1, 2, 3, 4), legacy=True)
+    run = load_run(made.ledger(made.manifest().runs()[0]))
+    assert counted(run).tolist() == [0.0, 100.0, 300.0, 700.0, 1100.0]
+    assert run.legacy_returns is not None
+    assert run.legacy_returns.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    report = build_grid_report(made)
+    assert "## As the released code shows it" in report.markdown
+    assert (report.folder / "released.png").exists()
+
+
 EVERY = [
     "{kind: round_robin}", "{kind: uniform}", "{kind: space, kappa: 2}", "{kind: random_growth, kappa: 2}",
     "{kind: cspace, kappa: 2}", "{kind: fixed, count: 3}", "{kind: plr}", "{kind: alp_gmm, fit_rate: 12}",
@@ -205,7 +220,7 @@ def test_ledgers_of_every_curriculum_are_looked_at(tmp_path: Path) -> None:
     growing = [row["curriculum"] for row in found["Curricula"]]
     assert {*growing} <= {label for label in labels if re.match("space|random|cspace|fixed", label)}
     assert any(label.startswith("space") for label in growing)
-    assert {row["label"].partition(" ")[0] for row in rows(report.folder / "curricula.csv")} == {
+    assert {row["label"].partition(" ")[0] for row in rows(report.folder / "inclusion.csv")} == {
         "round_robin", "space", "random_growth", "cspace", "fixed"
     }  # fmt: skip
     run = load_run(ran.grid.ledger(ran.manifest.runs()[0]))

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from space_dist.report.figures import COLOURS, dress, empty_figure, style_of, wrapped
 from space_dist.report.load import FloatArray, IntArray
 from space_dist.report.outcomes import profile
-from space_dist.report.statistics import confidence_interval
+from space_dist.report.statistics import confidence_interval, interquartile_mean
 
 FeatureCurves = Sequence[tuple[IntArray, FloatArray]]
 """Of each run `(T,)` environment steps at the iterations' ends, and `(T, d)` mean features of their sets."""
@@ -59,6 +59,27 @@ def draw_instances(labels: Sequence[str], curves: Sequence[tuple[IntArray, Float
     for axes in grid.flat[len(labels) :]:
         axes.set_axis_off()
     figure.legend(*grid.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def draw_both_counts(found: Sequence[tuple[str, Sequence[tuple[IntArray, FloatArray, FloatArray]]]]) -> Figure:
+    """Two diagrams of the same returns. `found`: label; of each run `(k,)` real steps, counted ones, and returns."""
+    figure = empty_figure(11.0, 4.4 + 0.22 * len(found))
+    real, counted = figure.subplots(1, 2, sharey=True)
+    for number, (label, curves) in enumerate(found):
+        for axes, which in ((real, 0), (counted, 1)):
+            last = min(float(curve[which][-1]) for curve in curves)
+            steps = np.linspace(0.0, last, _PLACES)
+            returns = np.stack([np.interp(steps, curve[which], curve[2]) for curve in curves])
+            axes.plot(steps, interquartile_mean(returns), label=wrapped(label, 90), linewidth=1.6, **style_of(number))
+            if len(returns) > 1:
+                low, high = confidence_interval(returns)
+                axes.fill_between(steps, low, high, alpha=0.15, color=style_of(number)["color"], lw=0)
+    dress(real, "over real environment steps", over_steps=True)
+    dress(counted, "over the released code's count", over_steps=True)
+    counted.set_xlabel("steps as the released code counts them")
+    real.set_ylabel("sum of r_t gamma^(T-1-t), stochastic policy\n(IQM over seeds, 95 % interval)")
+    figure.legend(*real.get_legend_handles_labels(), loc="outside lower center", frameon=False, fontsize=8)
     return figure
 
 

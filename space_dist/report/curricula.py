@@ -5,10 +5,11 @@ For cells that train on sets of instances, by the definitions of `analyses` (the
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -31,11 +32,12 @@ from space_dist.report.figures import png
 from space_dist.report.grid import CellRuns
 from space_dist.report.load import FloatArray, IntArray, Run
 from space_dist.report.statistics import Interval, estimate
-from space_dist.report.tables import NONE, Value, interval_text, number_text
+from space_dist.report.tables import NONE, Value, interval_numbers, interval_text, number_text
 
 _OF_SETS: Final = ("space", "cspace", "random_growth", "manual", "round_robin", "fixed")
 MAX_DRAWN: Final = 8  # cells in a figure of curricula
 MAX_AGREEING: Final = 12  # cells of the table of agreement
+_NAMED: Final = 4  # features in a title
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +155,7 @@ def _agreement(found: Sequence[CellCurricula]) -> list[Section]:
     for one in shown:
         row = {"curriculum": one.label}
         for other in shown:
-            alike = np.array_equal(one.ids, other.ids) and _same(one.contexts, other.contexts)
-            row[other.label] = f"{agreement(one.orders, other.orders):.2f}" if alike else NONE
+            row[other.label] = f"{agreement(one.orders, other.orders):.2f}" if _alike(one, other) else NONE
         rows.append(row)
     if len(shown) < 2:
         return []
@@ -162,8 +163,11 @@ def _agreement(found: Sequence[CellCurricula]) -> list[Section]:
     return [Section("Agreement between curricula", [text], rows)]
 
 
-def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
-    return one is None or other is None or np.array_equal(one, other)
+def _alike(one: CellCurricula, other: CellCurricula) -> bool:
+    """Whether both train on the same instances, as far as is known."""
+    if not np.array_equal(one.ids, other.ids) or one.cell.task != other.cell.task:
+        return False
+    return one.contexts is None or other.contexts is None or np.array_equal(one.contexts, other.contexts)
 
 
 def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
@@ -176,19 +180,59 @@ def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
             png(draw_frequencies([(one.label, _ranked(one), one.frequencies, one.weighted) for one in drawn]), note),
         )
     ]
-    known = [one for one in drawn if one.contexts is not None]
-    if known:
-        curves = [(one.label, one.over_steps, features_by_rank(one.orders, one.contexts))
-                  for one in known if one.over_steps is not None and one.contexts is not None]  # fmt: skip
-        caption = "Context features, scaled from their bounds: mean of the set, and of the instance at each rank"
-        pictures.append(Picture("context_features.png", caption, png(draw_features(known[0].features, curves), note)))
-    rows = [
-        {"curriculum": one.label, **{name: number_text(float(tau), 2) for name, tau in
-                               zip(one.features, feature_rank_correlations(one.orders, one.contexts), strict=True)}}
-        for one in known if one.contexts is not None and one.features == known[0].features
+    sections = [Section("When instances come", text, pictures=pictures)]
+    for features in dict.fromkeys(one.features for one in drawn if one.features):  # those of one environment
+        sections.append(_contexts([one for one in drawn if one.features == features], len(sections), note))
+    return sections
+
+
+def _contexts(found: Sequence[CellCurricula], number: int, note: str) -> Section:
+    """Of cells whose contexts have the same features, and known bounds."""
+    known = [(one, one.contexts, one.over_steps) for one in found if one.contexts is not None and one.over_steps]
+    names = found[0].features
+    curves = [(one.label, curves, features_by_rank(one.orders, contexts)) for one, contexts, curves in known]
+    caption = "Context features, scaled from their bounds: mean of the set, and of the instance at each rank"
+    file = "context_features.png" if number == 1 else f"context_features_{number}.png"
+    rows = []
+    for one, contexts, _ in known:
+        taus = feature_rank_correlations(one.orders, contexts)
+        rows.append({"curriculum": one.label, **{name: number_text(float(tau), 2)
+                                                 for name, tau in zip(names, taus, strict=True)}})  # fmt: skip
+    text = "Table: Kendall's tau-b between an instance's mean order of inclusion and each feature."
+    picture = Picture(file, caption, png(draw_features(names, curves), note))
+    return Section("Contexts: " + ", ".join(names[:_NAMED]), [text], rows, pictures=[picture])
+
+
+def curriculum_rows(found: Sequence[CellCurricula]) -> list[dict[str, Value]]:
+    """For CSV: a row a cell."""
+    rows: list[dict[str, Value]] = []
+    for one in found:
+        alike = consistency(one.orders)
+        rows.append({
+            "cell": one.cell.cell.id, "label": one.label, "seeds": len(one.orders),
+            "tau_with_others_mean": _or_none(alike.with_others, np.mean),
+            "tau_with_others_least": _or_none(alike.with_others, np.min),
+            "tau_with_others_most": _or_none(alike.with_others, np.max),
+            "tau_pairs_mean": _or_none(alike.pairs, np.mean),
+            "shift_mean": _or_none(one.shift_means, np.mean), "shift_most": _or_none(one.shift_peaks, np.max),
+            "jaccard_mean": _or_none(one.jaccards, np.mean), "rank_changes_mean": _or_none(one.changes, np.mean),
+            **interval_numbers("steps_below_half", estimate(one.below).mean.within(0.0, 1.0)),
+        })  # fmt: skip
+    return rows
+
+
+def agreement_rows(found: Sequence[CellCurricula]) -> list[dict[str, Value]]:
+    """For CSV: a row for every two cells on the same instances."""
+    return [
+        {"cell": one.cell.cell.id, "label": one.label, "other": other.cell.cell.id, "other_label": other.label,
+         "tau": agreement(one.orders, other.orders)}
+        for one, other in itertools.combinations(found, 2)
+        if _alike(one, other) and len(np.unique(one.orders)) > 1 < len(np.unique(other.orders))
     ]  # fmt: skip
-    text += ["Table: Kendall's tau-b between an instance's mean order of inclusion and each feature."] if rows else []
-    return [Section("Instances and their contexts", text, rows, pictures=pictures)]
+
+
+def _or_none(values: FloatArray, statistic: Callable[[FloatArray], Any]) -> float | None:
+    return None if not len(values) or np.isnan(values).any() else float(statistic(values))
 
 
 def _ranked(one: CellCurricula) -> IntArray:

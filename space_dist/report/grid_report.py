@@ -13,7 +13,13 @@ from space_dist.config import clean
 from space_dist.errors import ConfigError
 from space_dist.experiment import scaling
 from space_dist.experiment.manifest import Grid, Manifest
-from space_dist.report.curricula import curricula_of, curriculum_sections, inclusion_rows
+from space_dist.report.curricula import (
+    agreement_rows,
+    curricula_of,
+    curriculum_rows,
+    curriculum_sections,
+    inclusion_rows,
+)
 from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
 from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, draw_heat_map, draw_panels, png
 from space_dist.report.grid import (
@@ -31,9 +37,10 @@ from space_dist.report.grid import (
     run_folder,
     varying,
 )
-from space_dist.report.instances import instance_sections
+from space_dist.report.instances import forgetting_rows, instance_sections
 from space_dist.report.load import Configuration
 from space_dist.report.measures import Measured, measure_numbers, measure_sections, measured, paired_cell
+from space_dist.report.released import released_section
 from space_dist.report.statistics import FEWEST, Interval, estimate
 from space_dist.report.tables import (
     NONE,
@@ -152,6 +159,7 @@ def build_grid_report(
             *([Section("Instances and curricula", few)] if 0 < len(analysed) < len(cells) else []),
             *curriculum_sections(curricula, note),
             *instance_sections(analysed, note),
+            *released_section(analysed, note),
         ]
     sections += [Section("Remarks", items=remarks)] if remarks else []
     document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
@@ -159,7 +167,15 @@ def build_grid_report(
     files = {
         **{picture.file: picture.png for section in document.sections for picture in section.pictures},
         "cells.csv": to_csv([_numbers(*three) for three in zip(cells, compared, measures, strict=True)]).encode(),
-        **_more_csv({"curves.csv": _curve_rows(cells), "curricula.csv": inclusion_rows(curricula)}),
+        **_more_csv(
+            {
+                "curves.csv": _curve_rows(cells),
+                "inclusion.csv": inclusion_rows(curricula),
+                "curricula.csv": curriculum_rows(curricula),
+                "agreement.csv": agreement_rows(curricula),
+                "forgetting.csv": forgetting_rows(analysed),
+            }
+        ),
         "runs.csv": to_csv(_run_numbers(grid, cells)).encode(),
         "report.md": markdown.encode(),
         "report.html": to_html(document).encode(),

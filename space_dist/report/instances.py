@@ -14,8 +14,8 @@ from space_dist.report.figures import png
 from space_dist.report.grid import CellRuns
 from space_dist.report.load import FloatArray, IntArray, Run
 from space_dist.report.outcomes import forgotten, span
-from space_dist.report.statistics import estimate
-from space_dist.report.tables import interval_text
+from space_dist.report.statistics import Interval, estimate
+from space_dist.report.tables import Value, interval_numbers, interval_text
 
 SHARES: Final = (0.05, 0.1, 0.2)  # of the range of returns: by so much a return must rise, and fall again
 FEWEST: Final = 5  # evaluations that forgetting can be told from
@@ -28,12 +28,17 @@ Curves = Mapping[str, Sequence[tuple[IntArray, FloatArray]]]
 
 def instance_sections(cells: Sequence[CellRuns], note: str) -> list[Section]:
     """Profiles, curves and forgetting, of the cells that have a finished run; `note` is written on figures."""
-    curves = {cell.cell.id: [_curve(run) for run in cell.configuration.finished if run.evaluated_at_end]
-              for cell in cells}  # fmt: skip
+    curves = curves_of(cells)
     cells = [cell for cell in cells if curves[cell.cell.id]]
     if not cells:
         return []
     return [*_profiles(cells, curves, note), _every_instance(cells, curves, note), *_forgetting(cells, curves)]
+
+
+def curves_of(cells: Sequence[CellRuns]) -> dict[str, list[tuple[IntArray, FloatArray]]]:
+    """What became of each held-out instance, read anew."""
+    return {cell.cell.id: [_curve(run) for run in cell.configuration.finished if run.evaluated_at_end]
+            for cell in cells}  # fmt: skip
 
 
 def _curve(run: Run) -> tuple[IntArray, FloatArray]:
@@ -75,22 +80,33 @@ def _mean_curve(curves: Sequence[tuple[IntArray, FloatArray]]) -> tuple[IntArray
     return steps, np.asarray(np.mean(each, axis=0))
 
 
-def _forgetting(cells: Sequence[CellRuns], curves: Curves) -> list[Section]:
-    """How many instances fall again, by at least a share of the range of all returns of the task."""
-    rows = []
+def forgetting(cells: Sequence[CellRuns], curves: Curves) -> dict[str, dict[float, Interval]]:
+    """By cell and share of the range of all returns of the task: how many instances fall again by that, mean over runs.
+
+    Without cells whose runs have too few evaluations, or a return that is no number.
+    """
+    found = {}
     for cell in cells:
         own = [returns for _, returns in curves[cell.cell.id]]
-        if min(len(returns) for returns in own) < FEWEST:
+        if min(len(returns) for returns in own) < FEWEST or any(np.isnan(returns).any() for returns in own):
             continue
         whole = span([returns for other in cells if other.task == cell.task for _, returns in curves[other.cell.id]])
-        row, most = {"cell": cell.label}, own[0].shape[1]
-        for share in SHARES:
-            counts = np.array([forgotten(returns, share * whole).sum() for returns in own], dtype=np.float64)
-            found = estimate(counts).mean
-            row[f"fall by {100 * share:g} % of the range, mean [95 %]"] = (
-                f"{interval_text(found.within(0.0, most), 1)} of {most:,} ({len(own)}/{cell.summary.n_runs})"
-            )
-        rows.append(row)
+        counts = {share: [float(forgotten(returns, share * whole).sum()) for returns in own] for share in SHARES}
+        most = float(own[0].shape[1])
+        found[cell.cell.id] = {share: estimate(np.array(each)).mean.within(0.0, most) for share, each in counts.items()}
+    return found
+
+
+def _forgetting(cells: Sequence[CellRuns], curves: Curves) -> list[Section]:
+    found = forgetting(cells, curves)
+    rows = []
+    for cell in cells:
+        own = curves[cell.cell.id]
+        seeds = f"of {own[0][1].shape[1]:,} ({len(own)}/{cell.summary.n_runs})"
+        numbers = found.get(cell.cell.id, {})
+        texts = {f"fall by {100 * share:g} % of the range, mean [95 %]": f"{interval_text(one, 1)} {seeds}"
+                 for share, one in numbers.items()}  # fmt: skip
+        rows += [{"cell": cell.label, **texts}] if texts else []
     if not rows:
         return []
     text = (
@@ -98,3 +114,15 @@ def _forgetting(cells: Sequence[CellRuns], curves: Curves) -> list[Section]:
         "returns here, and ends at least as much, and at least two standard errors, below its peak; per run."
     )
     return [Section("Forgetting", [text], rows)]
+
+
+def forgetting_rows(cells: Sequence[CellRuns]) -> list[dict[str, Value]]:
+    """For CSV: a row a cell."""
+    curves = curves_of(cells)
+    found = forgetting([cell for cell in cells if curves[cell.cell.id]], curves)
+    return [
+        {"cell": cell.cell.id, "label": cell.label, "seeds": len(curves[cell.cell.id]),
+         **{key: value for share, one in found[cell.cell.id].items()
+            for key, value in interval_numbers(f"forgotten_{100 * share:g}_percent", one).items()}}
+        for cell in cells if cell.cell.id in found
+    ]  # fmt: skip

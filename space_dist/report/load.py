@@ -88,6 +88,15 @@ class Run:
             width = np.where(high > low, high - low, 1.0)
             return np.asarray((found[:, : len(low)] - low) / width)
 
+    @property
+    def legacy_returns(self) -> FloatArray | None:
+        """`(k,)` the released code's return on the held-out instances (`evaluation.legacy_metric`); None without."""
+        rows = [row for row in _rows(self.ledger, METRICS) if row.get("kind") == "evaluation"]
+        with _readable(self.ledger):
+            if not rows or any("legacy_return" not in row["test"] for row in rows):
+                return None
+            return np.array([row["test"]["legacy_return"] for row in rows], dtype=np.float64)
+
     def instance_returns(self, split: Split) -> FloatArray:
         """`(k, n)` each instance's mean return in each evaluation, instances by id; read anew.
 
