@@ -26,7 +26,15 @@ from space_dist.system.processes import collect_seldom
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIDS = ROOT / "configs/paper"
-KEPT = ("report.md", "cells.csv", "curves.csv", "curricula.csv", "inclusion.csv", "agreement.csv", "forgetting.csv")
+KEPT = (
+    "report.md",
+    "cells.csv",
+    "seeds.csv",
+    "curricula.csv",
+    "inclusion.csv",
+    "agreement.csv",
+    "forgetting.csv",
+)
 
 
 def results(

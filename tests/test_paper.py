@@ -94,7 +94,7 @@ def test_one_command_makes_an_artefact_always_the_same(tmp_path: Path, monkeypat
             shutil.rmtree(run)  # one of the four, which is made again
             break
     first, second = results
-    assert {"cells.csv", "curves.csv", "curves.png", "profiles.png", "provenance.json", "report.md"} <= first.keys()
+    assert {"cells.csv", "seeds.csv", "curves.png", "profiles.png", "provenance.json", "report.md"} <= first.keys()
     assert first == second
     provenance = json.loads(first["provenance.json"])
     assert provenance["command"] == "make results NAME=cartpole SCALE=0.02"

@@ -170,6 +170,7 @@ def build_grid_report(
         **_more_csv(
             {
                 "curves.csv": _curve_rows(cells),
+                "seeds.csv": _seed_rows(cells),
                 "inclusion.csv": inclusion_rows(curricula),
                 "curricula.csv": curriculum_rows(curricula),
                 "agreement.csv": agreement_rows(curricula),
@@ -473,6 +474,16 @@ def _curve_rows(cells: Sequence[CellRuns]) -> list[dict[str, Value]]:
             rows.append({"cell": cell.cell.id, "label": cell.label, "steps": step, "seeds": len(values),
                          **interval_numbers("test_return_iqm", found)})  # fmt: skip
     return rows
+
+
+def _seed_rows(cells: Sequence[CellRuns]) -> list[dict[str, Value]]:
+    """Every evaluation of every finished run: a row each, with six digits, which is more than seeds agree in."""
+    return [
+        {"cell": cell.cell.id, "label": cell.label, "seed": run.status.seed, "steps": step,
+         "test_return": float(f"{value:.6g}")}
+        for cell in cells for run in cell.configuration.finished
+        for step, value in zip(run.evaluation_steps.tolist(), run.test["return"].tolist(), strict=True)
+    ]  # fmt: skip
 
 
 def _run_numbers(grid: Grid, cells: Sequence[CellRuns]) -> list[dict[str, Value]]:
