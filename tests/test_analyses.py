@@ -22,7 +22,9 @@ from space_dist.report.analyses import (
     rank_changes,
     released_steps,
     share_below,
+    shares_of_first,
     shifts,
+    stretches,
     weighted_frequencies,
 )
 from space_dist.report.outcomes import (
@@ -497,3 +499,18 @@ def test_an_area_is_between_the_least_and_the_greatest_value(curve: dict[int, in
     steps = sorted(curve)
     values = floats(*(curve[step] for step in steps))
     assert values.min() - 1e-9 <= area(ints(*steps), values, budget) <= values.max() + 1e-9
+
+
+def test_a_set_stays_for_so_many_iterations():
+    # [20 20], [20] are the same set; then [10 20], [20] again, and [30] to the end.
+    trained = sets([20, 20], [20], [10, 20], [20], [30], [30], [30])
+    assert stretches(trained, IDS).tolist() == [2, 1, 1, 3]
+    assert stretches(sets([10]), IDS).tolist() == [1]
+
+
+def test_shares_of_the_first_episodes():
+    # Episodes 20 | 20 30 | 10 20 30 | 10 20 30: the first four are 20, 20, 30, and a third of each of 10, 20 and 30.
+    assert shares_of_first(TRAINED, IDS, 4) == pytest.approx([1 / 12, (2 + 1 / 3) / 4, (1 + 1 / 3) / 4, 0])
+    assert shares_of_first(TRAINED, IDS, 3).tolist() == pytest.approx([0, 2 / 3, 1 / 3, 0])
+    # Nine there are: 10 twice, 20 four times, 30 three times.
+    assert shares_of_first(TRAINED, IDS, 1000) == pytest.approx([2 / 9, 4 / 9, 3 / 9, 0])

@@ -140,6 +140,25 @@ def share_below(trained: Sequence[IntArray], ids: IntArray, ends: IntArray, shar
     return float(np.diff(ends, prepend=0)[small].sum() / ends[-1])
 
 
+def stretches(trained: Sequence[IntArray], ids: IntArray) -> IntArray:
+    """`(k,)` over how many iterations in a row the set stayed the same, one after the other; they sum to T."""
+    members = _members(trained, ids)
+    changes = np.flatnonzero((members[1:] != members[:-1]).any(axis=1)) + 1
+    return np.diff(np.concatenate(([0], changes, [len(members)]))).astype(np.int64)
+
+
+def shares_of_first(trained: Sequence[IntArray], ids: IntArray, episodes: int) -> FloatArray:
+    """`(n,)` each instance's share of a run's first episodes, if an iteration plays each of its set once.
+
+    The iteration in which that many are reached counts in proportion; a run of fewer counts whole.
+    """
+    members = _members(trained, ids)
+    sizes = members.sum(axis=1)
+    before = np.concatenate(([0], np.cumsum(sizes)[:-1]))
+    played = np.clip(episodes - before, 0, sizes)  # of each iteration
+    return np.asarray((members * (played / sizes)[:, None]).sum(axis=0) / played.sum())
+
+
 def feature_means(trained: Sequence[IntArray], ids: IntArray, features: FloatArray) -> FloatArray:
     """`(T, d)` the mean features of each iteration's set, in the units of the features `(n, d)`."""
     return _means(_members(trained, ids), features)

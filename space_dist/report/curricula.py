@@ -23,7 +23,9 @@ from space_dist.report.analyses import (
     inclusion_order,
     rank_changes,
     share_below,
+    shares_of_first,
     shifts,
+    stretches,
     weighted_frequencies,
 )
 from space_dist.report.analysis_figures import FeatureCurves, draw_features, draw_frequencies
@@ -35,6 +37,7 @@ from space_dist.report.statistics import Interval, estimate
 from space_dist.report.tables import NONE, Value, interval_numbers, interval_text, number_text
 
 _OF_SETS: Final = ("space", "cspace", "random_growth", "manual", "round_robin", "fixed")
+FIRST_EPISODES: Final = 40  # in which the paper's SPaCE hardly trains CartPole's long pole (section 4.1)
 MAX_DRAWN: Final = 8  # cells in a figure of curricula
 MAX_AGREEING: Final = 12  # cells of the table of agreement
 _NAMED: Final = 4  # features in a title
@@ -44,7 +47,8 @@ _NAMED: Final = 4  # features in a title
 class CellCurricula:
     """The curricula of a cell's s finished runs over its n training instances, all of one set.
 
-    orders `(s, n)` first iterations; frequencies, weighted `(n,)` means over runs; below `(s,)` share of the steps
+    orders `(s, n)` first iterations; frequencies, weighted, first `(n,)` means over runs; changes `(s,)` places that
+    change by weight; stretches `(s,)` median iterations that the set stays the same; below `(s,)` share of the steps
     spent on less than half of the instances. shift_means, shift_peaks, jaccards `(s,)`: NaN where a set never moved, or
     bounds are unknown. features: their names; by_rank `(n, d)`, correlations `(d,)`, and over steps: None where bounds
     are unknown.
@@ -55,7 +59,9 @@ class CellCurricula:
     orders: IntArray
     frequencies: FloatArray
     weighted: FloatArray
+    first: FloatArray
     changes: FloatArray
+    stretches: FloatArray
     below: FloatArray
     shift_means: FloatArray
     shift_peaks: FloatArray
@@ -81,7 +87,7 @@ def _curricula_of(cell: CellRuns) -> CellCurricula | None:
         return None
     ids = runs[0].instance_ids
     contexts = runs[0].instance_contexts
-    orders, each, weighted, changes, below, moved, curves = [], [], [], [], [], [], []
+    orders, each, weighted, first, changes, stayed, below, moved, curves = [], [], [], [], [], [], [], [], []
     for run in runs:
         trained = run.trained
         order, frequency = inclusion_order(trained, ids), frequencies(trained, ids)
@@ -89,15 +95,17 @@ def _curricula_of(cell: CellRuns) -> CellCurricula | None:
         orders.append(order)
         each.append(frequency)
         weighted.append(weight)
+        first.append(shares_of_first(trained, ids, FIRST_EPISODES))
         changes.append(float(rank_changes(frequency, weight)))
+        stayed.append(float(np.median(stretches(trained, ids))))
         below.append(share_below(trained, ids, run.iteration_ends))
         if contexts is not None:
             moved.append(_movement(run, trained, contexts))
             curves.append((run.iteration_ends, feature_means(trained, ids, contexts)))
     movement = np.array(moved or [(math.nan,) * 3] * len(runs))
     return CellCurricula(
-        cell, ids, np.array(orders), np.mean(each, axis=0), np.mean(weighted, axis=0), np.array(changes),
-        np.array(below), movement[:, 0], movement[:, 1], movement[:, 2],
+        cell, ids, np.array(orders), np.mean(each, axis=0), np.mean(weighted, axis=0), np.mean(first, axis=0),
+        np.array(changes), np.array(stayed), np.array(below), movement[:, 0], movement[:, 1], movement[:, 2],
         features=runs[0].features[: 0 if contexts is None else contexts.shape[1]], contexts=contexts,
         over_steps=curves or None,
     )  # fmt: skip
@@ -215,6 +223,7 @@ def curriculum_rows(found: Sequence[CellCurricula]) -> list[dict[str, Value]]:
             "tau_with_others_most": _or_none(alike.with_others, np.max),
             "tau_pairs_mean": _or_none(alike.pairs, np.mean),
             "shift_mean": _or_none(one.shift_means, np.mean), "shift_most": _or_none(one.shift_peaks, np.max),
+            "stretch_median": _or_none(one.stretches, np.median),
             "jaccard_mean": _or_none(one.jaccards, np.mean), "rank_changes_mean": _or_none(one.changes, np.mean),
             **interval_numbers("steps_below_half", estimate(one.below).mean.within(0.0, 1.0)),
         })  # fmt: skip
@@ -252,6 +261,7 @@ def _instance_rows(one: CellCurricula) -> list[dict[str, Value]]:
             "cell": one.cell.cell.id, "label": one.label, "instance": int(identity), "seeds": len(one.orders),
             "mean_order_of_inclusion": float(mean_order[place]), "frequency": float(one.frequencies[place]),
             "weighted_frequency": float(one.weighted[place]),
+            f"share_of_first_{FIRST_EPISODES}_episodes": float(one.first[place]),
         }
         for place, identity in enumerate(one.ids)
     ]  # fmt: skip
