@@ -77,6 +77,27 @@ def test_only_the_goal_varies() -> None:
     assert len({*train.contexts[:, 0]}) == 50
 
 
+def test_the_page_says_what_the_kept_results_say() -> None:
+    """Number for number: the table is made of them again."""
+    made = subprocess.run(
+        [sys.executable, ROOT / "jobs/claims.py"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=True,
+    ).stdout.strip()
+    page = (ROOT / "docs/results.md").read_text()
+    assert (
+        page.partition("<!-- claims: made by jobs/claims.py -->")[2].partition("<!-- end of claims -->")[0].strip()
+        == made
+    )
+    kept = [path.parent.name for path in (ROOT / "docs/results").glob("*/provenance.json")]
+    assert kept, "nothing is kept"
+    assert {*kept} <= {*GRIDS}  # none that is in small
+    assert made.count("\n| C") >= len(kept)
+
+
 def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, ROOT / "jobs/results.py", *arguments, "--root", folder / "runs", "--out", folder / "out"]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)

@@ -83,10 +83,11 @@ steps), both up to the smaller budget; its interval is of pairs of seeds, and th
 the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound (mean + t s sqrt(1 + 1/n)) of
 one more untrained seed.
 
-Early is the area under the curve of the return on the held-out instances over environment steps, divided by the budget
-(trapezoid; the mean return over training). The worst tenth (CVaR) are the held-out instances of least final return,
-chosen on one half of the evaluation episodes and measured on the other, both ways, and needs evaluation.episodes of two
-or more. Differences are taken seed by seed, with Student's t; p is of the two-sided Wilcoxon signed-rank test.
+Early is the area under the curve of the return on the held-out instances over environment steps (trapezoid), up to
+where the longest run of the same task ended, divided by that: the mean return over training. The worst tenth (CVaR) are
+the held-out instances of least final return, chosen on one half of the evaluation episodes and measured on the other,
+both ways, and needs evaluation.episodes of two or more. Differences are taken seed by seed, with Student's t; p is of
+the two-sided Wilcoxon signed-rank test.
 
 Curves are IQMs over the finished seeds (while a cell has none, over unfinished ones, which its label says) with the
 same intervals as bands. Steps are real environment steps of training.""".split("\n\n")

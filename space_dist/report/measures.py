@@ -45,7 +45,8 @@ class Measured:
 
 def measured(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[dict[str, Measured]]:
     """Every measure of every cell."""
-    values = {cell.cell.id: {name: _values(cell, name) for name in MEASURES} for cell in cells}
+    ends = {task: _last_step([cell for cell in cells if cell.task == task]) for task in {cell.task for cell in cells}}
+    values = {cell.cell.id: {name: _values(cell, name, ends[cell.task]) for name in MEASURES} for cell in cells}
     iqms = {name: estimates([np.array([*values[cell.cell.id][name].values()]) for cell in cells]) for name in MEASURES}
     found = []
     for place, (cell, comparison) in enumerate(zip(cells, compared, strict=True)):
@@ -72,16 +73,22 @@ def _measured(known: Estimate, ours: Mapping[int, float], theirs: Mapping[int, f
     )
 
 
-def _values(cell: CellRuns, name: str) -> dict[int, float]:
+def _last_step(cells: Sequence[CellRuns]) -> int:
+    """Where the longest of a task's finished runs ended: those that end by episodes never use up their steps."""
+    last = [run.evaluation_steps[-1] for cell in cells for run in cell.configuration.finished if run.evaluated_at_end]
+    return int(max(last, default=1))
+
+
+def _values(cell: CellRuns, name: str, last: int) -> dict[int, float]:
     """One measure, by finished seed; without those that have no such number."""
     runs = [run for run in cell.configuration.finished if run.evaluated_at_end]
-    values = {run.status.seed: _value(run, name, cell.cell.budget_steps) for run in runs}
+    values = {run.status.seed: _value(run, name, last) for run in runs}
     return values if name != "worst" else {seed: value for seed, value in values.items() if not math.isnan(value)}
 
 
-def _value(run: Run, name: str, budget: int) -> float:
+def _value(run: Run, name: str, last: int) -> float:
     if name == "early":
-        return area(run.evaluation_steps, run.test["return"], budget)
+        return area(run.evaluation_steps, run.test["return"], last)
     if name == "final":
         return run.last("test", "return")
     halves = run.final_halves("test")

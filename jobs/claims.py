@@ -1,0 +1,390 @@
+"""The claims of docs/results.md against what docs/results holds: numbers, words and verdicts by the page's own rules.
+
+    python jobs/claims.py            # print the table
+    python jobs/claims.py --write    # and put it into docs/results.md
+
+A claim whose grid was not run, or only in small, gets no verdict.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from space_dist.report.outcomes import area, paired_difference
+from space_dist.report.statistics import (
+    Interval,
+    estimate,
+    paired_ratio,
+    probability_of_improvement,
+    restricted,
+    start_bound,
+    steps_to_threshold,
+)
+from space_dist.report.tables import interval_text, number_text
+from space_dist.system.files import atomic_write
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+PAGE: Final = ROOT / "docs/results.md"
+BEGIN, END = "<!-- claims: made by jobs/claims.py -->", "<!-- end of claims -->"
+SAME: Final = 0.05  # of what the baseline learned
+
+FloatArray = NDArray[np.float64]
+Measure = Literal["early", "final"]
+Verdict = Literal["holds", "holds in part", "does not hold here", "not tested at full scale"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a claim: what was measured, in words; whether it is seen, and whether its contrary is."""
+
+    text: str
+    seen: bool
+    contradicted: bool = False
+
+
+class Cell:
+    """One cell's finished runs, as `seeds.csv` has them."""
+
+    def __init__(self, label: str, curves: Mapping[int, tuple[NDArray[np.int64], FloatArray]], budget: int) -> None:
+        self.label, self.curves, self.budget = label, curves, budget
+
+    def values(self, measure: Measure, at: int | None = None) -> dict[int, float]:
+        """By seed: the mean over training, or the return at a step (the last evaluation up to it); None: at the end."""
+        found = {}
+        for seed, (steps, returns) in self.curves.items():
+            if measure == "early":
+                found[seed] = area(steps, returns, self.budget)
+            else:
+                found[seed] = float(returns[-1 if at is None else np.searchsorted(steps, at, side="right") - 1])
+        return found
+
+    def iqm(self, measure: Measure = "final", at: int | None = None) -> Interval:
+        """Over seeds."""
+        return estimate(np.array([*self.values(measure, at).values()])).iqm
+
+    @cached_property
+    def learned(self) -> float:
+        """Final less first IQM."""
+        first = estimate(np.array([returns[0] for _, returns in self.curves.values()])).iqm
+        return self.iqm().value - first.value
+
+
+class Artefact:
+    """The folder of a grid in docs/results."""
+
+    def __init__(self, name: str) -> None:
+        self.folder = ROOT / "docs/results" / name
+        self.provenance = json.loads((self.folder / "provenance.json").read_text())
+        curves: dict[str, dict[int, list[tuple[int, float]]]] = {}
+        for row in self.rows("seeds.csv"):
+            seeds = curves.setdefault(row["label"], {})
+            seeds.setdefault(int(row["seed"]), []).append((int(row["steps"]), float(row["test_return"])))
+        last = max(points[-1][0] for seeds in curves.values() for points in seeds.values())  # of the longest run
+        self.cells = {
+            label: Cell(
+                label,
+                {seed: (np.array([step for step, _ in points]), np.array([value for _, value in points]))
+                 for seed, points in seeds.items()},
+                last,
+            )
+            for label, seeds in curves.items()
+        }  # fmt: skip
+
+    @property
+    def whole(self) -> bool:
+        """Whether all seeds and steps of the grid were run."""
+        return bool(self.provenance["scale"] == 1.0)
+
+    def rows(self, name: str) -> list[dict[str, str]]:
+        """A CSV file's."""
+        with (self.folder / name).open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    def row(self, name: str, label: str) -> dict[str, str]:
+        """Of a cell."""
+        return next(row for row in self.rows(name) if row["label"] == label)
+
+
+# ---- words ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A cell beside another by one measure, both intervals of P(better) and of the difference by seed."""
+
+    improvement: Interval
+    difference: Interval
+    p: float
+    text: str
+
+    @property
+    def better(self) -> bool:
+        return _above(self.improvement, 0.5) and _above(self.difference, 0.0)
+
+    @property
+    def worse(self) -> bool:
+        return _below(self.improvement, 0.5) and _below(self.difference, 0.0)
+
+
+def compared(ours: Cell, theirs: Cell, measure: Measure = "final", at: int | None = None) -> Compared:
+    """The words `better` and `worse` of the page."""
+    mine, other = ours.values(measure, at), theirs.values(measure, at)
+    both = sorted({*mine} & {*other})
+    pairs = [np.array([values[seed] for seed in both]) for values in (mine, other)]
+    improvement = probability_of_improvement(np.array([*mine.values()]), np.array([*other.values()]))
+    found = paired_difference(*pairs)
+    when = measure if at is None else f"at {at:,} steps"
+    text = (
+        f"{when} {interval_text(ours.iqm(measure, at))} against {interval_text(theirs.iqm(measure, at))}, P(better) "
+        f"{interval_text(improvement, 2)}, difference {interval_text(found.mean)}, p = {found.p:.2g} ({found.n} seeds)"
+    )
+    return Compared(improvement, found.mean, found.p, text)
+
+
+def same(ours: Cell, theirs: Cell, measure: Measure = "final") -> tuple[bool, Compared]:
+    """Whether the interval of the difference lies within the margin."""
+    found, margin = compared(ours, theirs, measure), SAME * theirs.learned
+    return _above(found.difference, -margin) and _below(found.difference, margin), found
+
+
+def ratio(ours: Cell, theirs: Cell) -> Interval | None:
+    """Of the steps until the other's final level; None where that is within noise of step 0, or nobody reaches it."""
+    level = theirs.iqm().value
+    if any(
+        level <= start_bound(np.array([returns[0] for _, returns in cell.curves.values()])) for cell in (ours, theirs)
+    ):
+        return None
+    both = sorted({*ours.curves} & {*theirs.curves})
+    budget = min(ours.budget, theirs.budget)
+    times = [
+        restricted(np.array([steps_to_threshold(*cell.curves[seed], level) for seed in both]), budget)
+        for cell in (ours, theirs)
+    ]
+    return paired_ratio(*times) if any((one < budget).any() for one in times) else None
+
+
+def _above(found: Interval, bound: float) -> bool:
+    return found.low is not None and found.low > bound
+
+
+def _below(found: Interval, bound: float) -> bool:
+    return found.high is not None and found.high < bound
+
+
+def _ratio_text(found: Interval | None) -> str:
+    return "steps to its final level: not comparable" if found is None else f"steps ratio {interval_text(found, 2)}"
+
+
+def better(ours: Cell, theirs: Cell, measure: Measure = "final", at: int | None = None, who: str = "") -> Part:
+    """A claim that one is better than the other."""
+    found = compared(ours, theirs, measure, at)
+    return Part(f"{who}{found.text}", found.better, found.worse)
+
+
+def worse(ours: Cell, theirs: Cell, measure: Measure = "final", at: int | None = None, who: str = "") -> Part:
+    """A claim that one is worse than the other."""
+    found = compared(ours, theirs, measure, at)
+    return Part(f"{who}{found.text}", found.worse, found.better)
+
+
+def alike(ours: Cell, theirs: Cell, measure: Measure = "final", who: str = "") -> Part:
+    """A claim that both are the same."""
+    seen, found = same(ours, theirs, measure)
+    return Part(f"{who}{found.text}", seen, found.better or found.worse)
+
+
+def faster(ours: Cell, theirs: Cell, times: float = 1.0, who: str = "") -> Part:
+    """A claim that one needs so many times fewer steps until the other's final level."""
+    found = ratio(ours, theirs)
+    if found is None:
+        return Part(f"{who}{_ratio_text(found)}", seen=False)
+    seen = _below(found, 1.0) and found.value <= 1.0 / times
+    return Part(f"{who}{_ratio_text(found)}", seen, _above(found, 1.0))
+
+
+# ---- claims ---------------------------------------------------------------------------------------------------------
+
+ROBIN, SPACE, CSPACE = "round_robin", "space eta=0.1 kappa=1", "cspace eta=0.1 kappa=1"
+
+
+def _cartpole_learning(found: Artefact) -> list[Part]:
+    ours, theirs = found.cells["space eta=0.025 kappa=1"], found.cells[ROBIN]
+    return [better(ours, theirs, measure) for measure in ("final", "early")]
+
+
+def _cartpole_poles(found: Artefact) -> list[Part]:
+    label = "space eta=0.025 kappa=1"
+    stretch = float(found.row("curricula.csv", label)["stretch_median"])
+    shares = [float(row["share_of_first_40_episodes"]) for row in found.rows("inclusion.csv") if row["label"] == label]
+    return [
+        Part(f"a set stays for {number_text(stretch, 1)} iterations in the median", stretch >= 3.0),
+        Part(f"the long pole has {100 * shares[2]:.0f} % of the first 40 episodes (short {100 * shares[0]:.0f} %, "
+             f"medium {100 * shares[1]:.0f} %)", shares[2] < 1 / 6),
+    ]  # fmt: skip
+
+
+def _same_and_ten_times_faster(found: Artefact) -> list[Part]:
+    ours, theirs = found.cells[SPACE], found.cells[ROBIN]
+    return [alike(ours, theirs), faster(ours, theirs, 10.0)]
+
+
+def _uniform(found: Artefact) -> list[Part]:
+    ours, theirs = found.cells[SPACE], found.cells[ROBIN]
+    return [faster(ours, theirs), better(ours, theirs)]
+
+
+def _spdrl(found: Artefact) -> list[Part]:
+    (ours,) = (cell for label, cell in found.cells.items() if label.startswith("spdrl"))
+    return [worse(ours, found.cells[ROBIN], measure) for measure in ("early", "final")]
+
+
+def _cspace(found: Artefact) -> list[Part]:
+    ours, other, theirs = (found.cells[label] for label in (SPACE, CSPACE, ROBIN))
+    return [
+        *(alike(ours, other, measure, "SPaCE against cSPaCE, ") for measure in ("final", "early")),
+        better(ours, theirs, who="SPaCE against round robin, "),
+        better(other, theirs, who="cSPaCE against round robin, "),
+    ]
+
+
+def _mazes(found: Artefact) -> list[Part]:
+    (ours,), (theirs,) = (
+        [cell for label, cell in found.cells.items() if kind in label and "1000" not in label]
+        for kind in (SPACE, ROBIN)
+    )
+    return [better(ours, theirs, "early"), faster(ours, theirs)]
+
+
+def _multiply(found: Artefact) -> list[Part]:
+    one = found.cells[SPACE]
+    return [worse(cell, one, "early", who=f"{label}: ") for label, cell in found.cells.items() if "multiply" in label]
+
+
+def _similar_curricula(found: Artefact) -> list[Part]:
+    parts = []
+    for label, name in ((SPACE, "SPaCE"), (CSPACE, "cSPaCE")):
+        least = float(found.row("curricula.csv", label)["tau_with_others_least"])
+        parts.append(Part(f"{name}: least tau with the other seeds {least:.2f}", least >= 0.9))
+    (tau,) = (
+        float(row["tau"])
+        for row in found.rows("agreement.csv")
+        if {row["label"], row["other_label"]} == {SPACE, CSPACE}
+    )
+    return [*parts, Part(f"tau between the two {tau:.2f}", abs(tau) <= 0.2)]
+
+
+def _shift(found: Artefact) -> list[Part]:
+    ours, other = (found.row("curricula.csv", label) for label in (SPACE, CSPACE))
+    mean, theirs = (100.0 * float(row["shift_mean"]) for row in (ours, other))
+    most, their_most = (100.0 * float(row["shift_most"]) for row in (ours, other))
+    text = (
+        f"{mean:.1f} % an iteration (SPaCE; at most {most:.1f} %), {theirs:.1f} % (cSPaCE; at most {their_most:.1f} %)"
+    )
+    return [Part(text, mean < 10.0 and mean < theirs)]
+
+
+def _places(found: Artefact) -> list[Part]:
+    parts = []
+    for label, name in ((SPACE, "SPaCE"), (CSPACE, "cSPaCE")):
+        changes = float(found.row("curricula.csv", label)["rank_changes_mean"])
+        parts.append(Part(f"{name}: {changes:.0f} instances change places", changes <= 4.0))
+    return parts
+
+
+def _forgetting(found: Artefact) -> list[Part]:
+    parts, intervals = [], []
+    for label, name in ((SPACE, "SPaCE"), (ROBIN, "round robin")):
+        row = found.row("forgetting.csv", label)
+        value, low, high = (row[f"forgotten_10_percent{end}"] for end in ("", "_low", "_high"))
+        one = Interval(float(value), *(float(end) if end else None for end in (low, high)))
+        intervals.append(one)
+        parts.append(Part(f"{name}: {interval_text(one, 1)} of 100", one.value < 15.0))
+    apart = _above(intervals[0], intervals[1].high or np.inf) or _above(intervals[1], intervals[0].high or np.inf)
+    return [*parts, Part("intervals apart" if apart else "not told apart", not apart)]
+
+
+def _target(found: Artefact) -> list[Part]:
+    cells = {label: cell for label, cell in found.cells.items() if "learning_rate=0.0003" in label}
+    (ours,), (space,), (robin,) = (
+        [cell for label, cell in cells.items() if kind in label] for kind in ("spdrl", SPACE, ROBIN)
+    )
+    others = {"SPDRL against SPaCE, ": space, "SPDRL against round robin, ": robin}
+    early = [worse(ours, other, at=200_000, who=who) for who, other in others.items()]
+    return early + [better(ours, other, who=who) for who, other in others.items()]
+
+
+Claim = Callable[[Artefact], list[Part]]
+CLAIMS: Final[Mapping[str, tuple[str, Claim]]] = {
+    "C1": ("cartpole", _cartpole_learning),
+    "C2": ("cartpole", _cartpole_poles),
+    "C3": ("ant", _same_and_ten_times_faster),
+    "C4": ("ball_catching", _same_and_ten_times_faster),
+    "C5 (PPO)": ("pointmass_uniform", _uniform),
+    "C5 (TRPO)": ("pointmass_uniform_trpo", _uniform),
+    "C6 (PPO)": ("pointmass_uniform", _spdrl),
+    "C6 (TRPO)": ("pointmass_uniform_trpo", _spdrl),
+    "C7 (PPO)": ("pointmass_uniform", _cspace),
+    "C7 (TRPO)": ("pointmass_uniform_trpo", _cspace),
+    "C8": ("maze", _mazes),
+    "C10": ("pointmass_multiply", _multiply),
+    "C12": ("pointmass_target", _target),
+    "C14 (PPO)": ("pointmass_uniform", _similar_curricula),
+    "C14 (TRPO)": ("pointmass_uniform_trpo", _similar_curricula),
+    "C16 (PPO)": ("pointmass_uniform", _shift),
+    "C16 (TRPO)": ("pointmass_uniform_trpo", _shift),
+    "C17 (PPO)": ("pointmass_uniform", _places),
+    "C17 (TRPO)": ("pointmass_uniform_trpo", _places),
+    "C18 (PPO)": ("pointmass_uniform", _forgetting),
+    "C18 (TRPO)": ("pointmass_uniform_trpo", _forgetting),
+}
+
+
+def verdict(parts: list[Part], *, whole: bool) -> Verdict:
+    """By the page's rules."""
+    if not whole:
+        return "not tested at full scale"
+    if all(part.seen for part in parts):
+        return "holds"
+    if any(part.contradicted for part in parts) or not any(part.seen for part in parts):
+        return "does not hold here"
+    return "holds in part"
+
+
+def table() -> str:
+    """Of the claims whose grid was run: what came out, and the verdict."""
+    lines = ["| | What came out | Verdict |", "|---|---|---|"]
+    for name, (grid, claim) in CLAIMS.items():
+        if not (ROOT / "docs/results" / grid / "provenance.json").exists():
+            continue
+        found = Artefact(grid)
+        parts = claim(found)
+        told = "; ".join(part.text + (" ✓" if part.seen else " ✗" if part.contradicted else "") for part in parts)
+        lines.append(f"| {name} | {told} | *{verdict(parts, whole=found.whole)}* |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Print, or write."""
+    made = table()
+    if sys.argv[1:] != ["--write"]:
+        print(made)
+        return 0
+    text = PAGE.read_text()
+    before, _, rest = text.partition(BEGIN)
+    after = rest.partition(END)[2]
+    atomic_write(PAGE, f"{before}{BEGIN}\n\n{made}\n\n{END}{after}".encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
