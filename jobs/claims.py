@@ -17,6 +17,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final, Literal
 
+import space_dist  # noqa: F401 - before NumPy, whose settings it makes
+
+# isort: split
 import numpy as np
 from numpy.typing import NDArray
 
@@ -369,7 +372,7 @@ def table() -> str:
         found = Artefact(grid)
         parts = claim(found)
         told = "; ".join(part.text + (" ✓" if part.seen else " ✗" if part.contradicted else "") for part in parts)
-        lines.append(f"| {name} | {told} | *{verdict(parts, whole=found.whole)}* |")
+        lines.append(f"| [{name}](results/{grid}/report.md) | {told} | *{verdict(parts, whole=found.whole)}* |")
     return "\n".join(lines)
 
 

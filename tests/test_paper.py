@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from space_dist.config import read_yaml
 from space_dist.envs.distributions import sample
+from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import load_grid
 from space_dist.grid.planning import plan
+from tests.grids import TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,7 +30,8 @@ def grid_file(name: str) -> Path:
 
 def test_every_row_of_the_page_has_its_grid() -> None:
     page = (ROOT / "docs/results.md").read_text()
-    rows = [line.split("|") for line in page.splitlines() if line.startswith("| C")]
+    claims = page.partition("## What came out")[0]
+    rows = [line.split("|") for line in claims.splitlines() if line.startswith("| C")]
     assert len(rows) == 18
     named = {name.strip(" `") for row in rows for name in row[3].replace(", 100 mazes", "").split(",")}
     assert named <= {*GRIDS}
@@ -92,40 +96,64 @@ def test_the_page_says_what_the_kept_results_say() -> None:
         page.partition("<!-- claims: made by jobs/claims.py -->")[2].partition("<!-- end of claims -->")[0].strip()
         == made
     )
-    kept = [path.parent.name for path in (ROOT / "docs/results").glob("*/provenance.json")]
-    assert kept, "nothing is kept"
-    assert {*kept} <= {*GRIDS}  # none that is in small
-    assert made.count("\n| C") >= len(kept)
+    names = [path.parent.name for path in (ROOT / "docs/results").glob("*/provenance.json")]
+    assert names, "nothing is kept"
+    assert {*names} <= {*GRIDS}  # none that is in small
+    assert made.count("\n| [C") >= len(names)
 
 
-def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, ROOT / "jobs/results.py", *arguments, "--root", folder / "runs", "--out", folder / "out"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+@pytest.fixture
+def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """jobs/results.py, whose grids are one tiny one."""
+    spec = importlib.util.spec_from_file_location("results_job", ROOT / "jobs/results.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    settings = {**TINY, **write_line_instances(tmp_path), "evaluation.episodes": 2}
+    write_grid(tmp_path, name="tiny", set=settings, seeds=[0, 1]).rename(tmp_path / "tiny.yaml")
+    monkeypatch.setattr(module, "GRIDS", tmp_path)
+    return module
 
 
-def test_one_command_makes_an_artefact_always_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
-    results: list[dict[str, bytes]] = []
-    for _ in range(2):
-        done = make(tmp_path, "cartpole", "--scale", "0.02")
-        assert done.returncode == 0, done.stdout + done.stderr
-        kept = sorted((tmp_path / "out/cartpole-scale-0.02").iterdir())
-        results.append({path.name: path.read_bytes() for path in kept})
-        for run in (tmp_path / "runs/paper-cartpole-scale-0.02").glob("*/s0"):
-            shutil.rmtree(run)  # one of the four, which is made again
-            break
-    first, second = results
-    assert {"cells.csv", "seeds.csv", "curves.png", "profiles.png", "provenance.json", "report.md"} <= first.keys()
+def kept(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_one_command_makes_an_artefact_always_the_same(job: Any, tmp_path: Path) -> None:
+    for place in ("one", "other"):
+        job.results("tiny", 0.5, tmp_path / place / "runs", tmp_path / place / "out")
+    first, second = (kept(tmp_path / place / "out/tiny-scale-0.5") for place in ("one", "other"))
+    # Forgetting cannot be told from two evaluations.
+    assert {*first} == {*job.KEPT, "provenance.json", *(name for name in first if name.endswith(".png"))} - {
+        "forgetting.csv"
+    }
+    assert {"curves.png", "profiles.png", "instances.png", "frequencies.png"} <= {*first}
     assert first == second
     provenance = json.loads(first["provenance.json"])
-    assert provenance["command"] == "make results NAME=cartpole SCALE=0.02"
-    assert (provenance["scale"], provenance["seeds"], provenance["cells"]) == (0.02, [0], 4)
-    assert provenance["environment_steps"] > 0
+    assert provenance["command"] == "make results NAME=tiny SCALE=0.5"
+    assert (provenance["scale"], provenance["seeds"], provenance["cells"]) == (0.5, [0], 2)
+    assert provenance["environment_steps"] == 2 * 256  # half of 768 steps are one update
     assert len(provenance["arithmetic"]) == 1
-    assert "A grid in small, scale 0.02" in first["report.md"].decode()
+    assert "A grid in small, scale 0.5" in first["report.md"].decode()
 
 
-def test_an_unknown_artefact_is_one_sentence(tmp_path: Path) -> None:
-    done = make(tmp_path, "cartpol")
+def test_what_is_kept_is_made_anew(job: Any, tmp_path: Path) -> None:
+    """Nothing of an earlier report stays behind; a whole grid has the plain name."""
+    out = tmp_path / "out/tiny"
+    out.mkdir(parents=True)
+    (out / "left.png").touch()
+    job.results("all", 1.0, tmp_path / "runs", tmp_path / "out")
+    assert "left.png" not in kept(out)
+    assert json.loads(kept(out)["provenance.json"])["command"] == "make results NAME=tiny"
+
+
+def test_an_unknown_artefact_is_one_sentence(job: Any, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"'tini' is no grid of the paper; did you mean 'tiny'[?]"):
+        job.results("tini", 1.0, tmp_path / "runs", tmp_path / "out")
+    done = subprocess.run(
+        [sys.executable, ROOT / "jobs/results.py", "cartpol"], cwd=ROOT, capture_output=True, text=True,
+        timeout=PATIENCE, check=False,
+    )  # fmt: skip
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
-    assert "'cartpol' is no grid of the paper; did you mean 'cartpole'?" in " ".join(done.stderr.split())
+    assert "did you mean 'cartpole'?" in done.stderr

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from space_dist.report.figures import COLOURS, dress, empty_figure, style_of, wrapped
 from space_dist.report.load import FloatArray, IntArray
@@ -94,6 +95,7 @@ def draw_frequencies(found: Sequence[tuple[str, IntArray, FloatArray, FloatArray
         axes.plot(ranks, frequencies[places], color=COLOURS[0], marker=".", markersize=4, linewidth=0.8, label="plain")
         axes.plot(ranks, weighted[places], color=COLOURS[1], linestyle="--", linewidth=1.6, label="weighted by rank")
         axes.set_xlabel("instance, by mean rank of inclusion")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.set_ylabel("share of iterations in the set")
         axes.set_ylim(0.0, 1.02)
         dress(axes, wrapped(label, _TITLE))

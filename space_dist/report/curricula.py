@@ -185,7 +185,10 @@ def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
         Picture(
             "frequencies.png",
             "Share of iterations that an instance was in the set: as it is, and weighted by the rank of inclusion",
-            png(draw_frequencies([(one.label, _ranked(one), one.frequencies, one.weighted) for one in drawn]), note),
+            png(
+                draw_frequencies([(one.cell.caption, _ranked(one), one.frequencies, one.weighted) for one in drawn]),
+                note,
+            ),
         )
     ]
     sections = [Section("When instances come", text, pictures=pictures)]
@@ -198,7 +201,7 @@ def _contexts(found: Sequence[CellCurricula], number: int, note: str) -> Section
     """Of cells whose contexts have the same features, and known bounds."""
     known = [(one, one.contexts, one.over_steps) for one in found if one.contexts is not None and one.over_steps]
     names = found[0].features
-    curves = [(one.label, curves, features_by_rank(one.orders, contexts)) for one, contexts, curves in known]
+    curves = [(one.cell.caption, curves, features_by_rank(one.orders, contexts)) for one, contexts, curves in known]
     caption = "Context features, scaled from their bounds: mean of the set, and of the instance at each rank"
     file = "context_features.png" if number == 1 else f"context_features_{number}.png"
     rows = []

@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
+from PIL import Image
 
 from space_dist.errors import LedgerError
 from space_dist.report.load import Configuration, FloatArray, IntArray, Run
@@ -36,6 +37,7 @@ _PANEL_LABEL: Final = 44  # characters in a line of a panel's legend
 _STEPS_LABEL: Final = "environment steps"
 _RETURN_LABEL: Final = "mean undiscounted return per episode"
 _DPI: Final = 150
+_COLOURS_KEPT: Final = 256
 
 
 def draw_comparison(configurations: Sequence[Configuration]) -> Figure:
@@ -284,12 +286,15 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def png(figure: Figure, note: str = "") -> bytes:
-    """The figure as a PNG file; with a note, it is written above everything."""
+    """The figure as a PNG file of 256 colours, a third of the bytes; with a note, it is written above everything."""
     if note:
         figure.suptitle(plain(note), fontsize=10, color="#B00020")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
-    return buffer.getvalue()
+    drawn, written = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=_DPI)
+    Image.open(drawn).convert("RGB").quantize(_COLOURS_KEPT, dither=Image.Dither.NONE).save(
+        written, "png", optimize=True
+    )
+    return written.getvalue()
 
 
 def style_of(number: int) -> dict[str, Any]:

@@ -64,6 +64,12 @@ class CellRuns:
         env = self.cell.config["env"]
         return json.dumps([env["id"], env.get("kwargs", {}), self.cell.config["instances"]["test"]], sort_keys=True)
 
+    @property
+    def caption(self) -> str:
+        """Its label, and how many seeds are finished: for figures of these."""
+        n = len(self.configuration.finished)
+        return f"{self.label} ({n} seed{'s' if n != 1 else ''})"
+
     @functools.cached_property
     def settings(self) -> dict[str, Any]:
         """Its place on the grid's axes, sections taken apart: `curriculum.kind`, `curriculum.eta`, ..."""

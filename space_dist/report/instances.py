@@ -54,7 +54,7 @@ def _profiles(cells: Sequence[CellRuns], curves: Curves, note: str) -> list[Sect
     for number, task in enumerate(tasks, start=1):
         drawn = [cell for cell in cells if cell.task == task][:MAX_PROFILES]
         scores = [np.concatenate([returns[-1] for _, returns in curves[cell.cell.id]]) for cell in drawn]
-        figure = draw_profiles([cell.label for cell in drawn], scores)
+        figure = draw_profiles([cell.caption for cell in drawn], scores)
         caption = "Share of runs × held-out instances whose final return is above tau (Agarwal et al. 2021)"
         name = "profiles.png" if len(tasks) == 1 else f"profiles_{number}.png"
         title = "Performance profiles" + (f": environment and test set of {drawn[0].label}" if len(tasks) > 1 else "")
@@ -65,7 +65,7 @@ def _profiles(cells: Sequence[CellRuns], curves: Curves, note: str) -> list[Sect
 def _every_instance(cells: Sequence[CellRuns], curves: Curves, note: str) -> Section:
     drawn = cells[:MAX_PANELS]
     text = [] if len(drawn) == len(cells) else [f"The first {MAX_PANELS} of {len(cells):,} cells."]
-    figure = draw_instances([cell.label for cell in drawn], [_mean_curve(curves[cell.cell.id]) for cell in drawn])
+    figure = draw_instances([cell.caption for cell in drawn], [_mean_curve(curves[cell.cell.id]) for cell in drawn])
     caption = (
         "Return of each held-out instance over environment steps, mean over seeds; black: tenths and median of them"
     )

@@ -29,7 +29,7 @@ _TEXT: Final = (
 
 def released_section(cells: Sequence[CellRuns], note: str) -> list[Section]:
     """A figure of the cells whose runs have that return; none where no cell has."""
-    found = [(cell.label, curves) for cell in cells if (curves := _curves(cell))][:_DRAWN]
+    found = [(cell.caption, curves) for cell in cells if (curves := _curves(cell))][:_DRAWN]
     if not found:
         return []
     caption = "The released code's return on the held-out instances, over real steps and over its count of them"
