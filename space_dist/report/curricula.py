@@ -9,10 +9,11 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
+from space_dist.errors import LedgerError
 from space_dist.report.analyses import (
     agreement,
     consistency,
@@ -28,7 +29,7 @@ from space_dist.report.analyses import (
     stretches,
     weighted_frequencies,
 )
-from space_dist.report.analysis_figures import FeatureCurves, draw_features, draw_frequencies
+from space_dist.report.analysis_figures import draw_features, draw_frequencies
 from space_dist.report.document import Picture, Section
 from space_dist.report.figures import png
 from space_dist.report.grid import CellRuns
@@ -44,83 +45,101 @@ _NAMED: Final = 4  # features in a title
 
 
 @dataclass(frozen=True, eq=False)
-class CellCurricula:
-    """The curricula of a cell's s finished runs over its n training instances, all of one set.
+class RunCurriculum:
+    """What one run did with its n training instances, in T iterations.
 
-    orders `(s, n)` first iterations; frequencies, weighted, first `(n,)` means over runs; changes `(s,)` places that
-    change by weight; stretches `(s,)` median iterations that the set stays the same; below `(s,)` share of the steps
-    spent on less than half of the instances. shift_means, shift_peaks, jaccards `(s,)`: NaN where a set never moved, or
-    bounds are unknown. features: their names; by_rank `(n, d)`, correlations `(d,)`, and over steps: None where bounds
-    are unknown.
+    order, frequencies, weighted, first `(n,)`: first iteration, share of iterations in the set, the same weighted by
+    rank, share of the first episodes. changes: instances that stand elsewhere when weighted. stretch: median iterations
+    that the set stays the same. below: share of the steps spent on less than half of the instances. shift_mean,
+    shift_most, jaccard: how far the set moves until it is whole; NaN where it never moved, or bounds are unknown.
+    means: `(T,)` steps at the iterations' ends and `(T, d)` mean features; None where bounds are unknown.
+    """
+
+    order: IntArray
+    frequencies: FloatArray
+    weighted: FloatArray
+    first: FloatArray
+    changes: float
+    stretch: float
+    below: float
+    shift_mean: float
+    shift_most: float
+    jaccard: float
+    means: tuple[IntArray, FloatArray] | None
+
+
+@dataclass(frozen=True, eq=False)
+class CellCurricula:
+    """The curricula of a cell's s finished runs over its n training instances.
+
+    ids `(n,)`; contexts `(n, d)`, scaled from their bounds to [0, 1], of `features`: None and empty where bounds are
+    unknown.
     """
 
     cell: CellRuns
     ids: IntArray
-    orders: IntArray
-    frequencies: FloatArray
-    weighted: FloatArray
-    first: FloatArray
-    changes: FloatArray
-    stretches: FloatArray
-    below: FloatArray
-    shift_means: FloatArray
-    shift_peaks: FloatArray
-    jaccards: FloatArray
-    features: tuple[str, ...]
     contexts: FloatArray | None
-    over_steps: FeatureCurves | None
+    features: tuple[str, ...]
+    runs: tuple[RunCurriculum, ...]
 
     @property
     def label(self) -> str:
         """The cell's."""
         return self.cell.label
 
+    @property
+    def orders(self) -> IntArray:
+        """`(s, n)` orders of inclusion."""
+        return np.array([run.order for run in self.runs])
+
+    def mean(self, name: Literal["frequencies", "weighted", "first"]) -> FloatArray:
+        """`(n,)` over runs."""
+        return np.asarray(np.mean([getattr(run, name) for run in self.runs], axis=0))
+
+    def each(self, name: Literal["changes", "stretch", "below", "shift_mean", "shift_most", "jaccard"]) -> FloatArray:
+        """`(s,)` a number of every run."""
+        return np.array([getattr(run, name) for run in self.runs])
+
 
 def curricula_of(cells: Sequence[CellRuns]) -> list[CellCurricula]:
-    """Those of the cells whose finished runs trained on sets; not of drawn or generated contexts."""
+    """Those of the cells whose finished runs trained on sets; not of drawn or generated contexts.
+
+    Raises LedgerError for a run that was trained on what is not of its instances.
+    """
     return [found for cell in cells if (found := _curricula_of(cell)) is not None]
 
 
 def _curricula_of(cell: CellRuns) -> CellCurricula | None:
     runs = [run for run in cell.configuration.finished if len(run.set_sizes)]
-    if not runs or any(run.generates_contexts for run in runs) or not _trains_on_sets(cell):
+    # Of other kinds the ledger's `trained` are the draws whose episodes ended.
+    of_sets = cell.cell.config.get("curriculum", {}).get("kind") in _OF_SETS
+    if not runs or not of_sets or any(run.generates_contexts for run in runs):
         return None
-    ids = runs[0].instance_ids
     contexts = runs[0].instance_contexts
-    orders, each, weighted, first, changes, stayed, below, moved, curves = [], [], [], [], [], [], [], [], []
-    for run in runs:
-        trained = run.trained
-        order, frequency = inclusion_order(trained, ids), frequencies(trained, ids)
-        weight = weighted_frequencies(frequency, order)
-        orders.append(order)
-        each.append(frequency)
-        weighted.append(weight)
-        first.append(shares_of_first(trained, ids, FIRST_EPISODES))
-        changes.append(float(rank_changes(frequency, weight)))
-        stayed.append(float(np.median(stretches(trained, ids))))
-        below.append(share_below(trained, ids, run.iteration_ends))
-        if contexts is not None:
-            moved.append(_movement(run, trained, contexts))
-            curves.append((run.iteration_ends, feature_means(trained, ids, contexts)))
-    movement = np.array(moved or [(math.nan,) * 3] * len(runs))
+    features = runs[0].features[: 0 if contexts is None else contexts.shape[1]]
     return CellCurricula(
-        cell, ids, np.array(orders), np.mean(each, axis=0), np.mean(weighted, axis=0), np.mean(first, axis=0),
-        np.array(changes), np.array(stayed), np.array(below), movement[:, 0], movement[:, 1], movement[:, 2],
-        features=runs[0].features[: 0 if contexts is None else contexts.shape[1]], contexts=contexts,
-        over_steps=curves or None,
+        cell, runs[0].instance_ids, contexts, features, tuple(_curriculum_of(run, contexts) for run in runs)
+    )
+
+
+def _curriculum_of(run: Run, contexts: FloatArray | None) -> RunCurriculum:
+    trained, ids = run.trained, run.instance_ids
+    try:
+        order, found = inclusion_order(trained, ids), frequencies(trained, ids)
+    except ValueError as error:
+        raise LedgerError(f"{run.ledger.folder} has iterations that cannot be read: {error}") from None
+    weighted = weighted_frequencies(found, order)
+    moved = None if contexts is None else shifts(trained, ids, contexts)
+    shifted = moved is not None and len(moved.steps) > 0
+    return RunCurriculum(
+        order, found, weighted, shares_of_first(trained, ids, FIRST_EPISODES),
+        changes=float(rank_changes(found, weighted)), stretch=float(np.median(stretches(trained, ids))),
+        below=share_below(trained, ids, run.iteration_ends),
+        shift_mean=float(moved.steps.mean()) if moved is not None and shifted else math.nan,
+        shift_most=float(moved.steps.max()) if moved is not None and shifted else math.nan,
+        jaccard=float(moved.jaccard.mean()) if moved is not None and shifted else math.nan,
+        means=None if contexts is None else (run.iteration_ends, feature_means(trained, ids, contexts)),
     )  # fmt: skip
-
-
-def _trains_on_sets(cell: CellRuns) -> bool:
-    """Whether the ledger's `trained` are the sets themselves, and not the draws whose episodes ended."""
-    return cell.cell.config.get("curriculum", {}).get("kind") in _OF_SETS
-
-
-def _movement(run: Run, trained: Sequence[IntArray], contexts: FloatArray) -> tuple[float, float, float]:
-    found = shifts(trained, run.instance_ids, contexts)
-    if not len(found.steps):
-        return math.nan, math.nan, math.nan
-    return float(found.steps.mean()), float(found.steps.max()), float(found.jaccard.mean())
 
 
 def curriculum_sections(found: Sequence[CellCurricula], note: str) -> list[Section]:
@@ -141,10 +160,12 @@ def _table(found: Sequence[CellCurricula]) -> Section:
                 "seeds": f"{len(one.orders)}/{one.cell.summary.n_runs}",
                 "tau with the other seeds: mean, least": _mean_and_least(alike.with_others),
                 "tau of pairs: mean": _mean(alike.pairs, 3),
-                "set moves an iteration: mean, most": _movement_text(one),
-                "Jaccard distance: mean": _mean(one.jaccards, 3),
-                "instances that change places by weight": _mean(one.changes, 1),
-                "steps on less than half of the set [95 %]": _percent(estimate(one.below).mean.within(0.0, 1.0)),
+                "set moves an iteration: mean, most": _movement(one),
+                "Jaccard distance: mean": _mean(one.each("jaccard"), 3),
+                "instances that change places by weight": _mean(one.each("changes"), 1),
+                "steps on less than half of the set [95 %]": _percent(
+                    estimate(one.each("below")).mean.within(0.0, 1.0)
+                ),
             }
         )
     text = (
@@ -186,7 +207,9 @@ def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
             "frequencies.png",
             "Share of iterations that an instance was in the set: as it is, and weighted by the rank of inclusion",
             png(
-                draw_frequencies([(one.cell.caption, _ranked(one), one.frequencies, one.weighted) for one in drawn]),
+                draw_frequencies(
+                    [(one.cell.caption, _ranked(one), one.mean("frequencies"), one.mean("weighted")) for one in drawn]
+                ),
                 note,
             ),
         )
@@ -199,7 +222,8 @@ def _figures(found: Sequence[CellCurricula], note: str) -> list[Section]:
 
 def _contexts(found: Sequence[CellCurricula], number: int, note: str) -> Section:
     """Of cells whose contexts have the same features, and known bounds."""
-    known = [(one, one.contexts, one.over_steps) for one in found if one.contexts is not None and one.over_steps]
+    known = [(one, one.contexts, [run.means for run in one.runs if run.means is not None])
+             for one in found if one.contexts is not None]  # fmt: skip
     names = found[0].features
     curves = [(one.cell.caption, curves, features_by_rank(one.orders, contexts)) for one, contexts, curves in known]
     caption = "Context features, scaled from their bounds: mean of the set, and of the instance at each rank"
@@ -219,17 +243,23 @@ def curriculum_rows(found: Sequence[CellCurricula]) -> list[dict[str, Value]]:
     rows: list[dict[str, Value]] = []
     for one in found:
         alike = consistency(one.orders)
-        rows.append({
-            "cell": one.cell.cell.id, "label": one.label, "seeds": len(one.orders),
-            "tau_with_others_mean": _or_none(alike.with_others, np.mean),
-            "tau_with_others_least": _or_none(alike.with_others, np.min),
-            "tau_with_others_most": _or_none(alike.with_others, np.max),
-            "tau_pairs_mean": _or_none(alike.pairs, np.mean),
-            "shift_mean": _or_none(one.shift_means, np.mean), "shift_most": _or_none(one.shift_peaks, np.max),
-            "stretch_median": _or_none(one.stretches, np.median),
-            "jaccard_mean": _or_none(one.jaccards, np.mean), "rank_changes_mean": _or_none(one.changes, np.mean),
-            **interval_numbers("steps_below_half", estimate(one.below).mean.within(0.0, 1.0)),
-        })  # fmt: skip
+        rows.append(
+            {
+                "cell": one.cell.cell.id,
+                "label": one.label,
+                "seeds": len(one.orders),
+                "tau_with_others_mean": _or_none(alike.with_others, np.mean),
+                "tau_with_others_least": _or_none(alike.with_others, np.min),
+                "tau_with_others_most": _or_none(alike.with_others, np.max),
+                "tau_pairs_mean": _or_none(alike.pairs, np.mean),
+                "shift_mean": _or_none(one.each("shift_mean"), np.mean),
+                "shift_most": _or_none(one.each("shift_most"), np.max),
+                "stretch_median": _or_none(one.each("stretch"), np.median),
+                "jaccard_mean": _or_none(one.each("jaccard"), np.mean),
+                "rank_changes_mean": _or_none(one.each("changes"), np.mean),
+                **interval_numbers("steps_below_half", estimate(one.each("below")).mean.within(0.0, 1.0)),
+            }
+        )
     return rows
 
 
@@ -259,12 +289,13 @@ def inclusion_rows(found: Sequence[CellCurricula]) -> list[dict[str, Value]]:
 
 def _instance_rows(one: CellCurricula) -> list[dict[str, Value]]:
     mean_order = one.orders.mean(axis=0)
+    frequency, weighted, first = one.mean("frequencies"), one.mean("weighted"), one.mean("first")
     return [
         {
             "cell": one.cell.cell.id, "label": one.label, "instance": int(identity), "seeds": len(one.orders),
-            "mean_order_of_inclusion": float(mean_order[place]), "frequency": float(one.frequencies[place]),
-            "weighted_frequency": float(one.weighted[place]),
-            f"share_of_first_{FIRST_EPISODES}_episodes": float(one.first[place]),
+            "mean_order_of_inclusion": float(mean_order[place]), "frequency": float(frequency[place]),
+            "weighted_frequency": float(weighted[place]),
+            f"share_of_first_{FIRST_EPISODES}_episodes": float(first[place]),
         }
         for place, identity in enumerate(one.ids)
     ]  # fmt: skip
@@ -281,10 +312,9 @@ def _mean_and_least(values: FloatArray) -> str:
     return NONE if not len(values) or np.isnan(values).any() else f"{values.mean():.3f}, {values.min():.3f}"
 
 
-def _movement_text(one: CellCurricula) -> str:
-    if np.isnan(one.shift_means).any():
-        return NONE
-    return f"{100.0 * one.shift_means.mean():.1f} %, {100.0 * one.shift_peaks.max():.1f} %"
+def _movement(one: CellCurricula) -> str:
+    means, most = one.each("shift_mean"), one.each("shift_most")
+    return NONE if np.isnan(means).any() else f"{100.0 * means.mean():.1f} %, {100.0 * most.max():.1f} %"
 
 
 def _percent(found: Interval) -> str:
