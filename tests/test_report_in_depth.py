@@ -14,6 +14,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from space_dist.api.grids import run_grid
+from space_dist.errors import LedgerError
 from space_dist.experiment.manifest import Grid
 from space_dist.ledger import CURRICULUM, METRICS, VALUES, Checkpoint, Ledger, RunWriter
 from space_dist.report import build_grid_report, load_run
@@ -159,6 +160,26 @@ def test_an_instance_that_falls_is_forgotten(tmp_path: Path) -> None:
     finish(made, 0, 0, growth, [[value, 0.0, number * 0.5, 1.0] for number, value in enumerate(falling)])
     (row,) = tables(build_grid_report(made).markdown)["Forgetting"]
     assert [text for name, text in row.items() if name.startswith("fall by")] == ["1.0 [—] of 4 (1/1)"] * 3
+
+
+def test_each_task_has_figures_of_its_own(tmp_path: Path) -> None:
+    """Returns of two environments have no common scale."""
+    points = [{"env.id": "space_dist/PointMass-v0"}, {"env.id": "space_dist/Maze-v0"}]
+    made = make_grid(tmp_path / "grid", points, n_seeds=1, kind="space")
+    for cell in range(2):
+        finish(made, cell, 0, EARLY, curve(0, 1, 2, 3, 4))
+    report = build_grid_report(made)
+    names = {path.stem for path in report.folder.glob("*.png")}
+    assert {"profiles_1", "profiles_2", "instances_1", "instances_2"} <= names
+    assert not {"profiles", "instances"} & names
+    assert [*tables(report.markdown)["Agreement between curricula"][0].values()][1:] == ["1.00", "—"]
+
+
+def test_a_run_on_other_instances_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    made = make_grid(tmp_path / "grid", [{"kappa": 1}], n_seeds=1, kind="space")
+    finish(made, 0, 0, ([2], [7], [0], [1]), curve(0, 1, 2, 3, 4))
+    with pytest.raises(LedgerError, match=r"iterations that cannot be read: .*7"):
+        build_grid_report(made)
 
 
 def test_without_halves_there_is_no_worst_tenth(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def instance_sections(cells: Sequence[CellRuns], note: str) -> list[Section]:
     cells = [cell for cell in cells if curves[cell.cell.id]]
     if not cells:
         return []
-    return [*_profiles(cells, curves, note), _every_instance(cells, curves, note), *_forgetting(cells, curves)]
+    return [*_of_each_task(cells, curves, note), *_forgetting(cells, curves)]
 
 
 def curves_of(cells: Sequence[CellRuns]) -> dict[str, list[tuple[IntArray, FloatArray]]]:
@@ -48,28 +48,39 @@ def _curve(run: Run) -> tuple[IntArray, FloatArray]:
     return run.evaluation_steps, returns
 
 
-def _profiles(cells: Sequence[CellRuns], curves: Curves, note: str) -> list[Section]:
+def _of_each_task(cells: Sequence[CellRuns], curves: Curves, note: str) -> list[Section]:
+    """Profiles and curves: returns of different tasks have no common scale."""
     sections = []
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     for number, task in enumerate(tasks, start=1):
-        drawn = [cell for cell in cells if cell.task == task][:MAX_PROFILES]
-        scores = [np.concatenate([returns[-1] for _, returns in curves[cell.cell.id]]) for cell in drawn]
-        figure = draw_profiles([cell.caption for cell in drawn], scores)
-        caption = "Share of runs × held-out instances whose final return is above tau (Agarwal et al. 2021)"
-        name = "profiles.png" if len(tasks) == 1 else f"profiles_{number}.png"
-        title = "Performance profiles" + (f": environment and test set of {drawn[0].label}" if len(tasks) > 1 else "")
-        sections.append(Section(title, pictures=[Picture(name, caption, png(figure, note))]))
+        own = [cell for cell in cells if cell.task == task]
+        which = f": environment and test set of {own[0].label}" if len(tasks) > 1 else ""
+        end = f"_{number}.png" if len(tasks) > 1 else ".png"
+        sections += [_profiles(own, curves, which, end, note), _every_instance(own, curves, which, end, note)]
     return sections
 
 
-def _every_instance(cells: Sequence[CellRuns], curves: Curves, note: str) -> Section:
+def _profiles(cells: Sequence[CellRuns], curves: Curves, which: str, end: str, note: str) -> Section:
+    drawn = cells[:MAX_PROFILES]
+    scores = [np.concatenate([returns[-1] for _, returns in curves[cell.cell.id]]) for cell in drawn]
+    figure = draw_profiles([cell.caption for cell in drawn], scores)
+    caption = "Share of runs × held-out instances whose final return is above tau (Agarwal et al. 2021)"
+    picture = Picture(f"profiles{end}", caption, png(figure, note))
+    return Section(f"Performance profiles{which}", _first(drawn, cells), pictures=[picture])
+
+
+def _every_instance(cells: Sequence[CellRuns], curves: Curves, which: str, end: str, note: str) -> Section:
     drawn = cells[:MAX_PANELS]
-    text = [] if len(drawn) == len(cells) else [f"The first {MAX_PANELS} of {len(cells):,} cells."]
     figure = draw_instances([cell.caption for cell in drawn], [_mean_curve(curves[cell.cell.id]) for cell in drawn])
     caption = (
         "Return of each held-out instance over environment steps, mean over seeds; black: tenths and median of them"
     )
-    return Section("Every held-out instance", text, pictures=[Picture("instances.png", caption, png(figure, note))])
+    picture = Picture(f"instances{end}", caption, png(figure, note))
+    return Section(f"Every held-out instance{which}", _first(drawn, cells), pictures=[picture])
+
+
+def _first(drawn: Sequence[CellRuns], cells: Sequence[CellRuns]) -> list[str]:
+    return [] if len(drawn) == len(cells) else [f"The first {len(drawn)} of {len(cells):,} cells."]
 
 
 def _mean_curve(curves: Sequence[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
