@@ -349,6 +349,7 @@ CLAIMS: Final[Mapping[str, tuple[str, Claim]]] = {
     "C17 (TRPO)": ("pointmass_uniform_trpo", _places),
     "C18 (PPO)": ("pointmass_uniform", _forgetting),
     "C18 (TRPO)": ("pointmass_uniform_trpo", _forgetting),
+    "C18 (only the goal varies)": ("pointmass_goal", _forgetting),
 }
 
 
