@@ -215,6 +215,8 @@ def faster(ours: Cell, theirs: Cell, times: float = 1.0, who: str = "") -> Part:
     return Part(f"{who}{_ratio_text(found)}", seen, _above(found, 1.0))
 
 
+Claim = Callable[[Artefact], list[Part]]
+
 # ---- claims ---------------------------------------------------------------------------------------------------------
 
 ROBIN, SPACE, CSPACE = "round_robin", "space eta=0.1 kappa=1", "cspace eta=0.1 kappa=1"
@@ -316,17 +318,19 @@ def _forgetting(found: Artefact) -> list[Part]:
     return [*parts, Part("intervals apart" if apart else "not told apart", not apart)]
 
 
-def _target(found: Artefact) -> list[Part]:
-    cells = {label: cell for label, cell in found.cells.items() if "learning_rate=0.0003" in label}
-    (ours,), (space,), (robin,) = (
-        [cell for label, cell in cells.items() if kind in label] for kind in ("spdrl", SPACE, ROBIN)
-    )
-    others = {"SPDRL against SPaCE, ": space, "SPDRL against round robin, ": robin}
-    early = [worse(ours, other, at=200_000, who=who) for who, other in others.items()]
-    return early + [better(ours, other, who=who) for who, other in others.items()]
+def _target(rate: str) -> Claim:
+    def claim(found: Artefact) -> list[Part]:
+        cells = {label: cell for label, cell in found.cells.items() if f"learning_rate={rate} " in label}
+        (ours,), (space,), (robin,) = (
+            [cell for label, cell in cells.items() if kind in label] for kind in ("spdrl", SPACE, ROBIN)
+        )
+        others = {"SPDRL against SPaCE, ": space, "SPDRL against round robin, ": robin}
+        early = [worse(ours, other, at=200_000, who=who) for who, other in others.items()]
+        return early + [better(ours, other, who=who) for who, other in others.items()]
+
+    return claim
 
 
-Claim = Callable[[Artefact], list[Part]]
 CLAIMS: Final[Mapping[str, tuple[str, Claim]]] = {
     "C1": ("cartpole", _cartpole_learning),
     "C2": ("cartpole", _cartpole_poles),
@@ -340,7 +344,8 @@ CLAIMS: Final[Mapping[str, tuple[str, Claim]]] = {
     "C7 (TRPO)": ("pointmass_uniform_trpo", _cspace),
     "C8": ("maze", _mazes),
     "C10": ("pointmass_multiply", _multiply),
-    "C12": ("pointmass_target", _target),
+    "C12 (learning rate 3e-4)": ("pointmass_target", _target("0.0003")),
+    "C12 (learning rate 3e-5)": ("pointmass_target", _target("3e-05")),
     "C14 (PPO)": ("pointmass_uniform", _similar_curricula),
     "C14 (TRPO)": ("pointmass_uniform_trpo", _similar_curricula),
     "C16 (PPO)": ("pointmass_uniform", _shift),
