@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Final, Literal
 
@@ -264,7 +265,7 @@ def _cspace(found: Artefact) -> list[Part]:
 
 def _mazes(found: Artefact) -> list[Part]:
     (ours,), (theirs,) = (
-        [cell for label, cell in found.cells.items() if kind in label and "1000" not in label]
+        [cell for label, cell in found.cells.items() if label.endswith(f" {kind}") and "1000" not in label]
         for kind in (SPACE, ROBIN)
     )
     return [better(ours, theirs, "early"), faster(ours, theirs)]
@@ -318,6 +319,63 @@ def _forgetting(found: Artefact) -> list[Part]:
     return [*parts, Part("intervals apart" if apart else "not told apart", not apart)]
 
 
+def _pooled(cells: Mapping[str, Cell], setting: str) -> Cell:
+    """All cells with a setting as one, whose seeds are (the other setting, seed), numbered."""
+    chosen = [cell for label, cell in cells.items() if setting in label.split()]
+    curves = {100 * seed + i: curve for i, cell in enumerate(chosen) for seed, curve in cell.curves.items()}
+    return Cell(setting, curves, chosen[0].budget)
+
+
+def _little_difference(found: Artefact) -> list[Part]:
+    parts = []
+    for name, values in (("kappa", ("1", "4", "16", "32")), ("eta", ("0.05", "0.1", "0.2", "0.4"))):
+        pooled = [_pooled(found.cells, f"{name}={value}") for value in values]
+        pairs = [(*same(ours, theirs), ours, theirs) for theirs, ours in combinations(pooled, 2)]
+        _, most, ours, theirs = max(pairs, key=lambda pair: abs(pair[1].difference.value))
+        levels = ", ".join(f"{cell.label} {interval_text(cell.iqm())}" for cell in pooled)
+        parts.append(
+            Part(
+                f"{levels}; furthest apart {ours.label} and {theirs.label}: difference "
+                f"{interval_text(most.difference)}, where the same is within {number_text(SAME * theirs.learned)}",
+                all(alike for alike, *_ in pairs),
+                any(pair.better or pair.worse for _, pair, *_ in pairs),
+            )
+        )
+    return parts
+
+
+def _sizes(found: Artefact) -> list[Part]:
+    cells = {
+        size: found.cells[f"train=../instances/pointmass_sizes_train_{size}.csv {SPACE}"]
+        for size in (25, 50, 100, 200, 400, 800, 1600)
+    }
+    hundred = cells[100]
+    fewer = [worse(cells[size], hundred, who=f"{size} against 100, ") for size in (25, 50)]
+    return fewer + [alike(cells[size], hundred, who=f"{size} against 100, ") for size in (200, 400, 800, 1600)]
+
+
+def _vds(found: Artefact) -> list[Part]:
+    ours, theirs = found.cells['vds members_see=["goal_x","goal_y"]'], found.cells[ROBIN]
+    ends, starts = ([returns[at] for _, returns in ours.curves.values()] for at in (-1, 0))
+    gained = paired_difference(np.array(ends), np.array(starts)).mean
+    return [
+        worse(ours, theirs),
+        Part(f"VDS's final less its first {interval_text(gained)}", not _above(gained, 0.0), _above(gained, 0.0)),
+    ]
+
+
+def _ant_curricula(found: Artefact) -> list[Part]:
+    taus = {
+        label: [float(found.row("curricula.csv", label)[f"tau_with_others_{end}"]) for end in ("least", "most")]
+        for label in (SPACE, CSPACE)
+    }
+    (low, high), (least, _) = taus[SPACE], taus[CSPACE]
+    return [
+        Part(f"SPaCE: tau with the other seeds {low:.2f} to {high:.2f}", low >= 0.1 and high <= 0.6),
+        Part(f"cSPaCE: least tau with the other seeds {least:.2f}", least >= 0.9),
+    ]
+
+
 def _target(rate: str) -> Claim:
     def claim(found: Artefact) -> list[Part]:
         cells = {label: cell for label, cell in found.cells.items() if f"learning_rate={rate} " in label}
@@ -343,11 +401,16 @@ CLAIMS: Final[Mapping[str, tuple[str, Claim]]] = {
     "C7 (PPO)": ("pointmass_uniform", _cspace),
     "C7 (TRPO)": ("pointmass_uniform_trpo", _cspace),
     "C8": ("maze", _mazes),
+    "C9 (PPO)": ("pointmass_table1", _little_difference),
+    "C9 (TRPO)": ("pointmass_table1_trpo", _little_difference),
     "C10": ("pointmass_multiply", _multiply),
+    "C11": ("ant_vds", _vds),
     "C12 (learning rate 3e-4)": ("pointmass_target", _target("0.0003")),
     "C12 (learning rate 3e-5)": ("pointmass_target", _target("3e-05")),
+    "C13": ("pointmass_sizes", _sizes),
     "C14 (PPO)": ("pointmass_uniform", _similar_curricula),
     "C14 (TRPO)": ("pointmass_uniform_trpo", _similar_curricula),
+    "C15": ("ant", _ant_curricula),
     "C16 (PPO)": ("pointmass_uniform", _shift),
     "C16 (TRPO)": ("pointmass_uniform_trpo", _shift),
     "C17 (PPO)": ("pointmass_uniform", _places),

@@ -6,9 +6,11 @@ import importlib.util
 import json
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from space_dist.config import read_yaml
@@ -103,13 +105,115 @@ def test_the_page_says_what_the_kept_results_say() -> None:
 
 
 @pytest.fixture
-def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """jobs/results.py, whose grids are one tiny one."""
-    spec = importlib.util.spec_from_file_location("results_job", ROOT / "jobs/results.py")
+def claims(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """jobs/claims.py, which looks for kept results in `tmp_path`."""
+    module = load_job("claims", monkeypatch)
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    return module
+
+
+class Kept:
+    """Results as `make results` keeps them, of values that are given."""
+
+    def __init__(self, root: Path, name: str) -> None:
+        cells = plan(grid_file(name), root / "runs").manifest.cells
+        self.labels = [cell.label for cell in cells]
+        self.folder = root / "docs/results" / name
+        self.folder.mkdir(parents=True)
+        (self.folder / "provenance.json").write_text(json.dumps({"scale": 1.0}))
+
+    def curves(self, finals: Mapping[str, float]) -> Kept:
+        """From 0 to the final return of the last key that is in a label, from which seeds and cells differ a little."""
+        spread = np.random.default_rng(0).normal(0.0, 0.02, (len(self.labels), 10))
+        rows = [
+            f"x,{quoted(label)},{seed},{steps},{share * (final_of(label, finals) + spread[i, seed])}"
+            for i, label in enumerate(self.labels)
+            for seed in range(10)
+            for steps, share in (
+                (0, 0.0),
+                (200_000, 0.5),
+                (400_000 + 9_000 * seed, 0.9),
+                (600_000, 0.9),
+                (800_000, 1.0),
+                (1_000_000, 1.0),
+            )
+        ]
+        (self.folder / "seeds.csv").write_text("\n".join(["cell,label,seed,steps,test_return", *rows]) + "\n")
+        return self
+
+    def csv(self, name: str, columns: Mapping[str, Mapping[str, object]]) -> None:
+        """`columns`: by label, its row."""
+        heads = [*next(iter(columns.values()))]
+        rows = [",".join([quoted(label), *(str(row[head]) for head in heads)]) for label, row in columns.items()]
+        (self.folder / name).write_text("\n".join([",".join(["label", *heads]), *rows]) + "\n")
+
+
+def quoted(label: str) -> str:
+    return '"' + label.replace('"', '""') + '"'
+
+
+def final_of(label: str, finals: Mapping[str, float]) -> float:
+    return [value for key, value in finals.items() if key in label][-1]
+
+
+@pytest.mark.parametrize(("name", "claim", "finals", "verdict"), [
+    ("pointmass_table1", "C9 (PPO)", {"": 10.0}, "holds"),
+    ("pointmass_table1_trpo", "C9 (TRPO)", {"": 10.0, "kappa=32": 10.2}, "holds"),
+    ("pointmass_table1", "C9 (PPO)", {"": 10.0, "kappa=32": 12.0, "eta=0.4": 12.0}, "does not hold here"),
+    ("pointmass_sizes", "C13", {"": 10.0, "_25.csv": 6.0, "_50.csv": 8.0}, "holds"),
+    ("pointmass_sizes", "C13", {"": 10.0, "_25.csv": 6.0}, "holds in part"),
+    ("pointmass_sizes", "C13", {"": 10.0, "_25.csv": 6.0, "_50.csv": 8.0, "_1600.csv": 12.0}, "does not hold here"),
+    ("ant_vds", "C11", {"": 10.0, "vds members_see": -1.0}, "holds"),
+    ("ant_vds", "C11", {"": 10.0, "vds members_see": 3.0}, "does not hold here"),
+    ("ant", "C3", {"": 10.0}, "holds in part"),
+    ("ball_catching", "C4", {"": 10.0, "space": 12.0}, "does not hold here"),
+    ("maze", "C8", {"": 10.0, "space": 12.0}, "holds"),
+    ("maze", "C8", {"": 10.0, "round_robin": 12.0}, "does not hold here"),
+    ("pointmass_uniform_trpo", "C5 (TRPO)", {"": 10.0, "space": 12.0}, "holds"),
+    ("pointmass_uniform_trpo", "C6 (TRPO)", {"": 10.0, "spdrl": 8.0}, "holds"),
+    ("pointmass_uniform_trpo", "C7 (TRPO)", {"": 10.0, "space": 12.0}, "holds"),
+    ("pointmass_multiply", "C10", {"": 10.0, "multiply": 9.0}, "holds"),
+    ("pointmass_target", "C12 (learning rate 3e-4)", {"": 10.0, "spdrl": 12.0}, "does not hold here"),
+])  # fmt: skip
+def test_a_claim_is_judged_by_the_rules_of_the_page(
+    claims: Any, tmp_path: Path, name: str, claim: str, finals: Mapping[str, float], verdict: str
+) -> None:
+    """On the cells that its grid has."""
+    Kept(tmp_path, name).curves(finals)
+    grid, parts = claims.CLAIMS[claim]
+    assert grid == name
+    assert claims.verdict(parts(claims.Artefact(name)), whole=True) == verdict
+    assert claims.verdict(parts(claims.Artefact(name)), whole=False) == "not tested at full scale"
+
+
+@pytest.mark.parametrize(("least", "most", "other", "verdict"), [
+    (0.14, 0.52, 0.95, "holds"), (0.14, 0.7, 0.95, "holds in part"), (0.0, 0.52, 0.5, "does not hold here")
+])  # fmt: skip
+def test_curricula_of_ant_are_judged_by_their_agreement(
+    claims: Any, tmp_path: Path, least: float, most: float, other: float, verdict: str
+) -> None:
+    kept = Kept(tmp_path, "ant").curves({"": 1.0})
+    taus = {claims.SPACE: (least, most), claims.CSPACE: (other, 1.0)}
+    kept.csv("curricula.csv", {
+        label: {"tau_with_others_least": low, "tau_with_others_most": high} for label, (low, high) in taus.items()
+    })  # fmt: skip
+    assert claims.verdict(claims.CLAIMS["C15"][1](claims.Artefact("ant")), whole=True) == verdict
+
+
+def load_job(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    spec = importlib.util.spec_from_file_location(f"{name}_job", ROOT / f"jobs/{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # where dataclasses look
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """jobs/results.py, whose grids are one tiny one."""
+    module = load_job("results", monkeypatch)
     settings = {**TINY, **write_line_instances(tmp_path), "evaluation.episodes": 2}
     write_grid(tmp_path, name="tiny", set=settings, seeds=[0, 1]).rename(tmp_path / "tiny.yaml")
     monkeypatch.setattr(module, "GRIDS", tmp_path)
