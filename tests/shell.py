@@ -29,7 +29,8 @@ ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```(?:bash|console)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 STEPS = 512
 UPDATE = {"n_steps": STEPS // 2, "n_epochs": 1, "batch_size": 64}
-OPTIONS = ("--set", f"budget.steps={STEPS}", "--set", f"evaluation.every_steps={STEPS}")  # of `train`, behind a page's
+# Behind those of a page's `train`. Mirroring into MLflow, which every run would start processes for, is `sync`'s here.
+OPTIONS = ("--set", f"budget.steps={STEPS}", "--set", f"evaluation.every_steps={STEPS}", "--set", "tracking.uri=null")
 _ASK = """#!/bin/bash
 {condition}
 printf '%s\\0' "$(($# + 2))" {program} "$PWD" "$@" >> "$PAGES_ASKED"
@@ -59,12 +60,14 @@ def executes(*blocks: Block) -> Callable[[Callable[..., None]], Callable[..., No
 class Shell:
     """Bash in `folder`, which looks like a clone whose configs are in small.
 
-    said: what it and its real programs have said.  typed: all words that were handed to this process.
+    said: what it and its real programs have said.  typed: all words that were handed to this process.  done: blocks of
+    pages that were executed.
     """
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.said, self._patch = folder, folder / "said.txt", monkeypatch
         self.typed: list[list[str]] = []
+        self.done: list[Block] = []
         self._asked, self._answered = folder / "asked", folder / "answered"
         tools = folder / "tools"
         for path in (self._asked, self._answered):
@@ -84,9 +87,15 @@ class Shell:
             "PAGES_ASKED": str(self._asked), "PAGES_ANSWERED": str(self._answered), "SPACE_DIST_ARITHMETIC": "",
         }  # fmt: skip
 
+    def block(self, page: str, number: int, replaced: Mapping[str, str] = {}, prelude: str = "", **how: Any) -> None:
+        """Type a block of a page; see `run`. prelude: what bash is told before."""
+        self.run(bash_blocks(page)[number], replaced, prelude=prelude, **how)
+        self.done.append((page, number))
+
     def run(
-        self, script: str, replaced: Mapping[str, str] = {}, answer: Callable[[list[str]], int] | None = None
-    ) -> None:
+        self, script: str, replaced: Mapping[str, str] = {}, prelude: str = "",
+        answer: Callable[[list[str]], int] | None = None,
+    ) -> None:  # fmt: skip
         """Type a block. replaced: what stands in it for something else, and what that is here; all of it must occur.
 
         answer: the exit code of words; by default `self.command`. Asserts that bash ends with 0, with `-e`.
@@ -98,7 +107,7 @@ class Shell:
         try:
             with self.said.open("ab") as said:
                 process = subprocess.Popen(
-                    ["bash", "-eu", "-c", script], cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL,
+                    ["bash", "-e", "-c", prelude + script], cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL,
                     stdout=said, stderr=said,
                 )  # fmt: skip
                 try:
@@ -175,18 +184,18 @@ def in_small(data: dict[str, Any], source: Path) -> dict[str, Any]:
     if isinstance(data["extends"], str) and "dqn" not in data["extends"]:
         settings |= {"learner.n_steps": STEPS // 2, "learner.n_epochs": 1}
     kept = {name: value for name, value in data.items() if name not in ("grid", "exclude", "baseline")}
-    return kept | {"set": data.get("set", {}) | settings, "zip": few, "seeds": [0]}
+    return kept | {"set": data.get("set", {}) | settings, "zip": few, "seeds": [0], "tracking": {"uri": None}}
 
 
 @contextmanager
-def one_supervisor(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def one_supervisor(folder: Path) -> Iterator[None]:
     """All grids are worked through by one process, which is started once, instead of by as many as there are cores.
 
     What it works on, every task says anew.
     """
     supervisor = warm.WarmSupervisor(folder)
     release, close = supervisor.release, supervisor.close
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(supervisor, "release", lambda: None)
         patch.setattr(supervisor, "close", lambda _: None)
         patch.setattr(warm, "WarmSupervisor", lambda _: supervisor)
