@@ -107,8 +107,8 @@ class Shell:
         try:
             with self.said.open("ab") as said:
                 process = subprocess.Popen(
-                    ["bash", "-e", "-c", prelude + script], cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL,
-                    stdout=said, stderr=said,
+                    ["bash", "-e", "-c", prelude + script], cwd=self.folder, env=self.environment,
+                    stdin=subprocess.DEVNULL, stdout=said, stderr=said,
                 )  # fmt: skip
                 try:
                     while process.poll() is None:

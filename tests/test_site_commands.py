@@ -73,7 +73,12 @@ def test_what_is_not_done_is_on_a_page() -> None:
 
 
 def test_a_block_that_fails_is_found(shell: Shell) -> None:
-    for script in ("space-dist trian x", "space-dist configs && false", "python jobs/nothing.py", "space-dist env check x"):
+    for script in (
+        "space-dist trian x",
+        "space-dist configs && false",
+        "python jobs/nothing.py",
+        "space-dist env check x",
+    ):
         with pytest.raises(AssertionError):
             shell.run(script)
     shell.run("for name in a b; do space-dist configs --copy quickstart $name; done; [ -d b/grids ]")
