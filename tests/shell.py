@@ -65,16 +65,18 @@ class Shell:
     """
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.folder, self.said, self._patch = folder, folder / "said.txt", monkeypatch
+        aside = folder.parent / f"{folder.name}-aside"  # what no clone has: a Ray job's working folder is sent whole
+        self.folder, self.said, self._patch = folder, aside / "said.txt", monkeypatch
         self.typed: list[list[str]] = []
         self.done: list[Block] = []
-        self._asked, self._answered = folder / "asked", folder / "answered"
-        tools = folder / "tools"
+        self._asked, self._answered, tools = aside / "asked", aside / "answered", aside / "tools"
+        aside.mkdir()
         for path in (self._asked, self._answered):
             os.mkfifo(path)
         tools.mkdir()
         python = shlex.quote(sys.executable)
-        ours = f'[[ "$1" == jobs/* ]] || exec {python} "$@"'
+        here = f'[ "$PWD" = {shlex.quote(str(folder))} ]'  # and not in a Ray job
+        ours = f'{{ {here} && [[ "$1" == jobs/* ]]; }} || exec {python} "$@"'
         native = f'[ -z "$SPACE_DIST_ARITHMETIC" ] || exec {python} -P -m space_dist.cli "$@"'
         for name, condition in (("space-dist", native), ("python", ours)):
             (tools / name).write_text(_ASK.format(condition=condition, program=name))

@@ -65,7 +65,8 @@ def test_kernels(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     works = off_policy._works
     monkeypatch.setattr(off_policy, "_works", lambda steps: {
         kind: dataclasses.replace(work, settings=(
-            *work.settings, "learner.learning_starts=480", "budget.steps=512", "evaluation.every_steps=512",
+            *work.settings, "learner.learning_starts=100", "learner.gradient_steps_per_step=0.1", "budget.steps=512",
+            "evaluation.every_steps=512",
         )) for kind, work in works(steps).items()
     })  # fmt: skip
     bench.more = ("--rounds", "1", "--steps", "512")
@@ -79,8 +80,11 @@ def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pyte
     for name, value in {"PILOT": range(9000, 9003), "FEWEST": 3, "MOST": 3}.items():
         monkeypatch.setattr(equivalence, name, value)
 
-    def run(words: list[str], **how: Any) -> subprocess.CompletedProcess[bytes]:
-        assert words[:3] == [sys.executable, "-m", "space_dist.cli"]
+    ran = subprocess.run
+
+    def run(words: list[str], **how: Any) -> Any:
+        if words[:3] != [sys.executable, "-m", "space_dist.cli"]:
+            return ran(words, **how)
         assert how == {"stdout": subprocess.DEVNULL, "check": False}
         return subprocess.CompletedProcess(words, command(monkeypatch, *words[3:]))
 

@@ -97,7 +97,6 @@ test_a_block_that_fails_is_found.executes = ()  # type: ignore[attr-defined]
 def test_training(shell: Shell) -> None:
     """All in one folder, as one would go through the page. Of the actors: tests/test_site_cluster.py."""
     first, _, instances, _ = bash_blocks("training.md")
-    shell.run("space-dist train configs/pointmass_round_robin.yaml")  # which is reported on
     shell.block("training.md", 0, {"source .venv/bin/activate": ":", "--workers 4": "--workers 0"})
     assert "--workers 4" in first
     shell.block("training.md", 2)

@@ -482,8 +482,8 @@ class Grid:
 
 
 def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
-    """The grid that a user names: its folder, its manifest.json, its YAML file (frozen below `root`, at a scale), or its
-    name below `root`.
+    """The grid that a user names: its folder, its manifest.json, its name below `root`, or its YAML file (frozen below
+    `root`, at a scale).
 
     Raises ConfigError if there is nothing of the kind, and for a scale of what is frozen already; LedgerError if a YAML
     file's grid was never frozen.
