@@ -1,8 +1,8 @@
 """The pages as a site, and what they tell people to type.
 
 Every block that one types is executed as a whole: see tests/test_site_commands.py, which names the files, and sees to
-it that none is left out. Python, YAML and commands of docs/python.md, docs/sb3.md and the three pages about what is one's
-own are executed by tests of their own (`ELSEWHERE`).
+it that none is left out. Python, YAML and commands of docs/python.md, docs/sb3.md and the three pages about what is
+one's own are executed by tests of their own (`ELSEWHERE`).
 
 Here all commands of `space-dist`, `jobs/*.py` and `ray` are held against their own parsers, and not in small:
 sub-commands, options and types, files that begin with `configs/` or `jobs/` and names that begin with `shipped:` must

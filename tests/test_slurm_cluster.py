@@ -28,8 +28,8 @@ from space_dist.slurm import Export, Profile
 from space_dist.slurm import export as write_scripts
 from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
 from tests.patience import PATIENCE
-from tests.slurm.gated_env import GATE
 from tests.shell import bash_blocks, executes, write_small_configs
+from tests.slurm.gated_env import GATE
 from tests.slurm.profiles import FIELDS, RESERVATION, exports
 from tests.test_grid_tracking import everything
 from tests.test_tracking import histories
@@ -289,7 +289,7 @@ def test_what_the_page_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> No
         cwd=tmp_path, env=slurm.environment, capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "sbatch: no objection" in done.stdout
+    assert "sbatch --test-only: no objection" in done.stdout
     told = json.loads(done.stdout[done.stdout.index("{") :])
     assert (told["grid"], told["counts"]) == ("pointmass_small", {"waiting": 2})
     jobs = [line.split()[0] for line in (tmp_path / "shared/pointmass_small" / JOBS).read_text().splitlines()]
