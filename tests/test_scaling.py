@@ -50,7 +50,7 @@ def test_a_grid_in_small_has_less_of_seeds_and_steps_and_all_else(tmp_path: Path
             "evaluation.every_steps": (
                 8_000,
                 5_000,
-            ),  # a quarter of the steps; two evaluations after the start, of five
+            ),  # a quarter of the steps, two evaluations instead of five
         }
 
 

@@ -34,8 +34,9 @@ def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
     """A run of that share of the budget, at least one update of it.
 
     There are fewer evaluations, by the share's square root rounded down, evenly spread, and always at the start and the
-    end: curves remain, and evaluating, which is most of the cost of a short run, costs less as well. All else stays, so schedules over the budget are steeper, and a set that grows by one gets less far. `where` names the config
-    in errors. Raises ConfigError if the result is no config.
+    end: curves remain, and evaluating, which is most of the cost of a short run, costs less as well. All else stays, so
+    schedules over the budget are steeper, and a set that grows by one gets less far. `where` names the config in
+    errors. Raises ConfigError if the result is no config.
     """
     if scale == WHOLE:
         return config
