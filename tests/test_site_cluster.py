@@ -119,7 +119,7 @@ def test_the_pages_on_a_cluster(place: Place, monkeypatch: pytest.MonkeyPatch) -
     on_head = {"http://HEAD:8265": place.address, "/shared": shared}
     shell.block("grids.md", 0, on_head)
     assert (place.shell.folder / "home/space_dist/runs/pointmass_small/manifest.json").is_file()
-    shell.block("training.md", 1, {**on_head, "--out /shared/pointmass_small": f"--out {shared}/exported"})
+    shell.block("training.md", 1, on_head)
     shell.block("ray.md", 3, {"/shared": shared})
     assert [grid.ledger(run).status_file.read_bytes() for run in runs] == before  # nothing ran twice
     assert Ledger(place.shared / "runs/pointmass_space/s0").status().state == "done"
