@@ -193,7 +193,7 @@ def in_small(data: dict[str, Any], source: Path) -> dict[str, Any]:
 def one_supervisor(folder: Path) -> Iterator[None]:
     """All grids are worked through by one process, which is started once, instead of by as many as there are cores.
 
-    What it works on, every task says anew.
+    What it works on, every task says anew. It answers one grid's one place: never with `--max-parallel 2`.
     """
     supervisor = warm.WarmSupervisor(folder)
     release, close = supervisor.release, supervisor.close

@@ -89,7 +89,7 @@ def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pyte
         return subprocess.CompletedProcess(words, command(monkeypatch, *words[3:]))
 
     monkeypatch.setattr(equivalence.subprocess, "run", run)
-    bench.more = ("--steps", "4096")
+    bench.more = ("--steps", "4096", "--max-parallel", "1")
     codes: list[int] = []
 
     def answer(words: list[str]) -> int:
