@@ -101,7 +101,8 @@ def head(place: Place) -> None:
 
 
 def node(place: Place) -> None:
-    """The second, on `node1`. After everything else: a run's driver finds its own raylet where a machine has one."""
+    """The second, on `node1`; after everything else, since a run that joined two raylets of one machine has failed."""
+    place.shell.environment.pop("RAY_ADDRESS", None)  # a job server's, which is no address to `ray start`
     gcs, agent = place.ports[0], place.ports[3]
     place.shell.block("ray.md", 1, {"head:6379": f"127.0.0.1:{gcs}"}, f"AGENT={agent}\n{STARTED}")
     place.shell.run(f"ray status --address=127.0.0.1:{gcs}")
