@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 _WATCH_SECONDS = 1.0
 _FILES = (".yaml", ".yml")
 _FAILED, _UNFINISHED = 1, 3  # exit codes of `tune status`
-_STATES = ("complete", "pruned", "failed", "open")
 
 
 class _RunsFiles(TyperGroup):
@@ -61,10 +60,10 @@ def tune_plan(tune: TunePath, root: Root = None, as_json: Json = False) -> None:
     if as_json:
         print_json({"folder": str(made.grid.folder), "steps": made.steps, "new": made.new} | _numbers(search))
         return
-    seeds, arms = len(manifest.seeds), len(search.arms)
+    seeds = len(manifest.seeds)
     say(
-        f"{arms} arm{'s' if arms > 1 else ''} x {search.config['trials']} trials x {seeds} seed{'s' if seeds > 1 else ''}"
-        f" = {search.total * seeds} runs, {made.steps:,} environment steps"
+        f"{len(search.arms)} arms x {search.config['trials']} trials x {seeds} seeds = {search.total * seeds} runs, "
+        f"{made.steps:,} environment steps"
         + (" at most: trials that are given up get fewer" if search.config["pruner"] else "")
     )
     for arm, record in search.arms.items():
@@ -202,7 +201,7 @@ def _search_of(place: Grid, manifest: Manifest) -> Search:
 
 def _summary(manifest: Manifest, search: Search) -> str:
     counts = Counter(trial.state for trial in search.trials)
-    parts = [f"{counts[state]} {state}" for state in _STATES if counts[state]]
+    parts = [f"{count} {state}" for state, count in sorted(counts.items())]
     return f"{manifest.name}: {len(search.trials)} of {search.total} trials asked: {', '.join(parts)}"
 
 

@@ -203,6 +203,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
     data = configs.read_yaml(place)
     if "env" in data and "extends" not in data:
         raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
+    _refuse_search(data, path)
     grid = configs.check(GridConfig, data, str(path))
     folder = place.absolute().parent
     bases = {base: configs.read(Path(configs.beside(base, folder))) for base in grid.extends}
@@ -225,6 +226,11 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
     if not cells:
         raise ConfigError(f"{path}: exclude leaves no cell")
     return grid, cells
+
+
+def _refuse_search(data: Mapping[str, Any], path: Path) -> None:
+    if "arms" in data:
+        raise ConfigError(f"{path} is a search: space-dist tune run {path}. A grid has no `arms`")
 
 
 def _from_folder(value: Any, folder: Path) -> Any:
@@ -519,7 +525,9 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
-    config = configs.check(GridConfig, configs.read_yaml(configs.located(path)), str(path))
+    data = configs.read_yaml(configs.located(path))
+    _refuse_search(data, path)
+    config = configs.check(GridConfig, data, str(path))
     grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale)))
     if not grid.manifest_file.exists():
         small = "" if scale == scaling.WHOLE else f" --scale {scale:g}"
