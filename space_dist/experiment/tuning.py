@@ -18,7 +18,6 @@ from space_dist import config as configs
 from space_dist.config import NAME, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment.manifest import MAX_RUNS, Grid, GridTracking, Retry, RunResources, SeedRange
-from space_dist.ledger import Row
 
 MAX_TRIALS = 10_000  # of an arm
 _MAX_CHOICES = 1000
@@ -343,7 +342,7 @@ def confirmation_of(name: str) -> str:
     return f"{name}{_CONFIRMED}"
 
 
-def is_search(data: Row) -> bool:
+def is_search(data: Mapping[str, Any]) -> bool:
     """Whether what a YAML file holds is a search, and no grid and no run."""
     return "arms" in data and "env" not in data
 
