@@ -338,7 +338,7 @@ def _little_difference(found: Artefact) -> list[Part]:
                 f"{levels}; furthest apart {ours.label} and {theirs.label}: difference "
                 f"{interval_text(most.difference)}, where the same is within {number_text(SAME * theirs.learned)}",
                 all(alike for alike, *_ in pairs),
-                any(pair.better or pair.worse for _, pair, *_ in pairs),
+                any(not alike and (pair.better or pair.worse) for alike, pair, *_ in pairs),
             )
         )
     return parts

@@ -233,7 +233,7 @@ def test_a_run_that_is_there_is_neither_overwritten_nor_repeated(
     assert (code, "--resume" in error) == (2, True)
     code, _, error = run(capsys, *train("curriculum.eta=0.2", "budget.steps=9000", out=finished), "--resume")
     assert code == 2
-    assert "curriculum.eta: 0.1 -> 0.2" in error
+    assert "curriculum.eta: 0.4 -> 0.2" in error
     assert "budget.steps: 4096 -> 9000" in error
     code, out, _ = run(capsys, *train(out=finished), "--resume")
     assert (code, "already done" in out) == (0, True)

@@ -542,7 +542,7 @@ def test_what_does_not_go_together_is_refused(curriculum: str, words: list[str])
 
 def test_multiply_is_refused_also_where_kappa_comes_from_elsewhere():
     with pytest.raises(ConfigError, match=r"curriculum: growth: multiply with kappa: 1 never grows"):
-        load(SPACE, ["curriculum.growth=multiply"])
+        load(SPACE.parent / "presets/space_ppo2_pointmass.yaml", ["curriculum.growth=multiply"])  # whose kappa is 1
     assert load(SPACE, ["curriculum.growth=multiply", "curriculum.kappa=2"]).curriculum.kind == "space"
 
 

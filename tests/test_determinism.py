@@ -25,6 +25,7 @@ def settings(learner: str) -> list[str]:
     made = [
         "budget.steps=3360", "learner.n_steps=112", "rollout.slots=4", "evaluation.every_steps=1680",
         "checkpoint.every_rounds=1", "tracking.uri=null", "learner.n_epochs=2",
+        "curriculum.eta=0.1", "curriculum.kappa=1",  # a set that grows all along
     ]  # fmt: skip
     if learner == "trpo":  # the shipped config is PPO's: what only PPO has goes
         made.append(

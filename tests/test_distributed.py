@@ -22,7 +22,7 @@ from tests.patience import PATIENCE
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
     "budget.steps=8192", "learner.n_steps=1024", "rollout.slots=2", "learner.n_epochs=2", "evaluation.every_steps=4000",
-    "tracking.uri=null",
+    "tracking.uri=null", "curriculum.eta=0.1", "curriculum.kappa=1",
 ]  # fmt: skip
 
 pytestmark = pytest.mark.ray

@@ -204,6 +204,18 @@ def test_an_ensemble_learns_differs_and_is_restored_bit_for_bit() -> None:
     assert scored(fresh(1)).tobytes() != scored(fresh()).tobytes()
 
 
+@pytest.mark.parametrize("units", [(1,), (8, 1), (1, 1)])
+def test_gains_are_those_of_a_layers_place_and_not_of_its_width(units: tuple[int, ...]) -> None:
+    """SB3's: the root of two in hidden layers, one of one unit as well, and 1 in the last."""
+    config = vds_config()
+    learner = config.learner.model_copy(update={"net_arch": units})
+    space = Blueprint.of(config).spec.observation_space
+    ensemble = Ensemble(config.curriculum, learner, space, ("target",), seed=0)  # type: ignore[arg-type]
+    for layers in ensemble.policy(Statistics()).members:
+        gains = [np.linalg.norm(weight, ord=2) for weight, _ in layers]  # of an orthogonal matrix
+        assert gains == pytest.approx([np.sqrt(2.0)] * len(units) + [1.0], rel=1e-5)
+
+
 def test_stacked_members_take_the_steps_that_each_would_take_alone() -> None:
     config = vds_config()
     worker, _, shards = tiny_shards(config)

@@ -35,7 +35,7 @@ def test_a_scale_that_is_no_share_is_refused(scale: float, tmp_path: Path) -> No
 
 
 def test_a_grid_in_small_has_less_of_seeds_and_steps_and_all_else(tmp_path: Path) -> None:
-    settings = {"budget.steps": 40_000, "budget.episodes": 7, "evaluation.every_steps": 9_000, "learner.n_steps": 512}
+    settings = {"budget.steps": 40_000, "budget.episodes": 7, "evaluation.every_steps": 8_000, "learner.n_steps": 512}
     path = write_grid(tmp_path, set=settings, seeds=[3, 4, 5, 6])
     whole, small = (plan(path, tmp_path / "runs", scale) for scale in (1.0, 0.25))
     assert (small.grid.folder.name, small.manifest.name) == (f"{whole.manifest.name}-scale-0.25",) * 2
@@ -47,7 +47,10 @@ def test_a_grid_in_small_has_less_of_seeds_and_steps_and_all_else(tmp_path: Path
         assert {key: (value, after[key]) for key, value in before.items() if value != after[key]} == {
             "budget.steps": (40_000, 10_000),
             "budget.episodes": (7, 2),
-            "evaluation.every_steps": (9_000, 4_500),  # a quarter of the steps, half of the evaluations
+            "evaluation.every_steps": (
+                8_000,
+                5_000,
+            ),  # a quarter of the steps, two evaluations instead of five
         }
 
 

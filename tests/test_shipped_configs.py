@@ -86,7 +86,7 @@ FACTS: dict[str, dict[str, Any]] = {
     "curricula/pointmass_plr": RIVALS,
     "curricula/pointmass_learnability": {**RIVALS, "curriculum.uniform_share": 0.5},
     "curricula/pointmass_uniform": RIVALS,
-    "pointmass_space": {**RIVALS, "curriculum.eta": 0.1, "curriculum.kappa": 1, "budget.steps": 1_000_000},
+    "pointmass_space": {**RIVALS, "curriculum.eta": 0.4, "curriculum.kappa": 16, "budget.steps": 1_000_000},
     "pointmass_round_robin": {**RIVALS, "budget.steps": 1_000_000},
     "antgoal_space": {**RIVALS, "env.kwargs": {"horizon": 500}},
     "antgoal_round_robin": {**RIVALS, "env.kwargs": {"horizon": 500}},

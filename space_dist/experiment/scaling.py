@@ -33,19 +33,22 @@ def fewer(seeds: Sequence[int], scale: float) -> tuple[int, ...]:
 def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
     """A run of that share of the budget, at least one update of it.
 
-    There are fewer evaluations, by the share's square root: curves remain, and evaluating costs less as well. All else
-    stays, so schedules over the budget are steeper, and a set that grows by one gets less far. `where` names the config
-    in errors. Raises ConfigError if the result is no config.
+    There are fewer evaluations, by the share's square root rounded down, evenly spread, and always at the start and the
+    end: curves remain, and evaluating, which is most of the cost of a short run, costs less as well. All else stays, so
+    schedules over the budget are steeper, and a set that grows by one gets less far. `where` names the config in
+    errors. Raises ConfigError if the result is no config.
     """
     if scale == WHOLE:
         return config
     data: dict[str, Any] = config.model_dump(mode="json")
     budget, evaluation = data["budget"], data["evaluation"]
+    whole = budget["steps"]
     budget["steps"] = max(math.ceil(budget["steps"] * scale - 1e-6), data["learner"].get("n_steps") or 1)
     if budget["episodes"] is not None:
         budget["episodes"] = math.ceil(budget["episodes"] * scale - 1e-6)
     if isinstance(evaluation["every_steps"], int):
-        evaluation["every_steps"] = math.ceil(evaluation["every_steps"] * math.sqrt(scale) - 1e-6)
+        count = max(1, math.floor(whole / evaluation["every_steps"] * math.sqrt(scale) + 1e-6))
+        evaluation["every_steps"] = math.ceil(budget["steps"] / count)
     return configs.parse(data, where)
 
 
