@@ -28,8 +28,10 @@ from space_dist.grid.tuning import HeldUpError, advance, confirmation, open_runs
 from space_dist.report import build_grid_report, load_run
 from space_dist.report.objective import over_seeds
 from space_dist.report.search_report import build_search_report
+from space_dist.tracking import sync
 from tests.commanding import command
 from tests.grids import SMALL, write_grid
+from tests.test_grid_tracking import levels
 from tests.test_report import continue_run, start_run
 from tests.tunes import ARMS, RATE, ROOT, end, reached, search_through, write_tune
 
@@ -603,6 +605,22 @@ def test_drawing_reads_the_record_alone(tmp_path: Path) -> None:
     asked = [dict(trial.parameters) for trial in search.of_arm("space") if trial.generation == 2]
     assert draw(reread, "space", 2) == asked
     assert isinstance(reread.trials[0], Trial)
+
+
+def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(uri: str, tmp_path: Path) -> None:
+    path, root = write_tune(tmp_path, tracking={"uri": uri, "experiment": "demo"}), tmp_path / "runs"
+    ids = set()
+    for generations in (1, 2):
+        grid, manifest = search_through(path, root, generations=generations)
+        sync([], grids=[grid])
+        parent, trials, runs = levels(uri)
+        ids.add(parent.info.run_id)
+        begun = [trial for trial in search_of(manifest).trials if trial.state != "open"]
+        assert {*trials} == {f"{trial.arm} {trial.number}" for trial in begun}
+        assert len(runs) == 3 * len(begun)
+    assert len(ids) == 1  # though the plan has grown
+    assert parent.data.params["arms"] == "round_robin, space"
+    assert trials["space 3"].data.tags["setting.learner.learning_rate"]
 
 
 # ---- the command ----------------------------------------------------------------------------------------------------
