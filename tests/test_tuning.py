@@ -8,6 +8,7 @@ import json
 import math
 import random
 import re
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,10 @@ def arm(**changes: Any) -> dict[str, Any]:
         ({"confirm": {"seeds": [9], "instances": {"test": GOAL}}}, ("confirm.instances", "shares 100 of its 100")),
         ({"confirm": {"seeds": [9], "instances": {"test": "gone.csv"}}}, ("gone.csv",)),
         ({"confirm": {"seeds": [9], "instances": {"test": UNIFORM}, "set": {"seed": 1}}}, ("confirm.set.seed",)),
+        ({"confirm": {"seeds": [9], "instances": {"test": UNIFORM}, "set": {"budget.step": 1}}},
+         ("confirm.set", "budget.step", "did you mean 'steps'")),
+        ({"confirm": {"seeds": [9], "instances": {"test": UNIFORM}, "set": {"instances.test": GOAL}}},
+         ("named by confirm.instances",)),
         ({"confirm": None}, ("confirm", "required")),
         ({"objective": {"kind": "steps"}}, ("objective", "needs a threshold")),
         ({"objective": {"kind": "final", "threshold": 1.0}}, ("threshold says nothing",)),
@@ -607,7 +612,16 @@ def test_drawing_reads_the_record_alone(tmp_path: Path) -> None:
     assert isinstance(reread.trials[0], Trial)
 
 
-def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(uri: str, tmp_path: Path) -> None:
+def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(
+    uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported: list[Path] = []
+
+    def build(grid: Grid, out: Path) -> None:  # drawing takes seconds
+        reported.append(grid.folder)
+        (out / "report.html").write_text("a report")
+
+    monkeypatch.setattr("space_dist.report.search_report.build_search_report", build)
     path, root = write_tune(tmp_path, tracking={"uri": uri, "experiment": "demo"}), tmp_path / "runs"
     ids = set()
     for generations in (1, 2):
@@ -619,6 +633,7 @@ def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(uri: str, tmp_
         assert {*trials} == {f"{trial.arm} {trial.number}" for trial in begun}
         assert len(runs) == 3 * len(begun)
     assert len(ids) == 1  # though the plan has grown
+    assert reported == [grid.folder] * 2
     assert parent.data.params["arms"] == "round_robin, space"
     assert trials["space 3"].data.tags["setting.learner.learning_rate"]
 
@@ -655,6 +670,33 @@ def test_commands_tell_how_a_search_stands(
     assert "holds a search: space-dist tune run" in capsys.readouterr().err
     assert command(monkeypatch, "slurm", "export", root / "search", "--out", tmp_path / "out") == 2
     assert "is a search" in capsys.readouterr().err
+
+
+def test_a_missing_optuna_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module in ("space_dist.grid.tuning", "space_dist.experiment.sampling"):
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    assert command(monkeypatch, "tune", "plan", write_tune(tmp_path)) == 2
+    assert "a search needs Optuna: pip install 'space-dist[tune]'" in capsys.readouterr().err
+
+
+def test_a_search_without_a_cell_can_be_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every setting of the generation was refused."""
+    made = plan_search(write_tune(tmp_path), tmp_path)
+    search = search_of(made.manifest)
+    refused = [dataclasses.replace(trial, cell="", state="failed") for trial in search.trials]
+    manifest = dataclasses.replace(made.manifest, cells=(), baseline="", search=search.with_trials(refused))
+    made.grid.freeze(manifest, {})
+    assert command(monkeypatch, "grid", "status", made.grid.folder) == 0
+    assert "has no cells yet" in capsys.readouterr().out
+    assert "Failed trials" in build_search_report(made.grid).markdown
+    after = advance(made.grid, manifest)
+    assert after is not None
+    assert len(search_of(after).open) == 4
 
 
 def _refused(

@@ -258,6 +258,8 @@ class TuneConfig(Section):
                 raise ValueError(f"{section}.{key} is nothing that trials may differ in: {_SAME_FOR_ALL[shared]}")
         if any(_within(key, "instances") for key in self.confirm.set):
             raise ValueError("confirm.set: the final instances are named by confirm.instances")
+        if "init_from" in self.confirm.set:
+            raise ValueError("confirm.set.init_from: what is confirmed starts from what the search's runs started from")
         for name, arm in self.arms.items():
             searched = [*self.search, *arm.search]
             if not searched:

@@ -30,7 +30,7 @@ from space_dist.experiment.manifest import Cell, Grid, Manifest, Run
 from space_dist.experiment.sampling import completions, draw, given_up, optuna_version
 from space_dist.experiment.search import ArmRecord, Search, Trial
 from space_dist.experiment.status import RunStatus, run_statuses
-from space_dist.experiment.tuning import Distribution, Pruner, TuneConfig, base_of, confirmation_of, load_tune, put
+from space_dist.experiment.tuning import Distribution, Pruner, TuneConfig, base_of, confirmation_of, load_tune
 from space_dist.grid.conductor import freeze
 from space_dist.grid.planning import InstanceFiles, frozen_cell, resolved_cell
 from space_dist.instances import InstanceSet, refuse_overlap, repeats
@@ -174,6 +174,8 @@ class _Planned:
                 )
             cell, steps = frozen_cell(self.config.resources, config, {}, name, "", self._files, self._specs)
             self._final = self._final_sets(config)
+        with about("confirm.set"):
+            resolved_cell(self.config.name, name, _with(_with(data, setting), self.config.confirm.set), "confirm.set")
         self.steps += steps * len(self.config.seed_list()) * self.config.trials
         base = {**data, "instances": dict(cell.config["instances"])}
         if "init_from" in cell.config and cell.config["init_from"] is not None:
@@ -429,8 +431,7 @@ def confirmation(grid: Grid, manifest: Manifest) -> Path:
         if best is None:
             raise ConfigError(f"arm {arm} has nothing to confirm: none of its {config.trials} trials is complete")
         data = _with(record.base, best.parameters)
-        for key, value in config.confirm.set.items():
-            put(data, key, value, grid.folder)
+        data = _with(data, config.confirm.set)
         for split, path in search.final.items():
             configs.put(data, f"instances.{split}", f"../{path}", "confirm")
         if data.get("init_from") is not None:
@@ -454,5 +455,5 @@ def confirmation(grid: Grid, manifest: Manifest) -> Path:
     except OSError as error:
         raise LedgerError(f"cannot write {folder}: {in_words(error)}") from None
     for arm in search.arms:
-        configs.load(folder / f"{arm}.yaml")  # for its errors: what confirm.set changes may not be a config
+        configs.load(folder / f"{arm}.yaml")  # for its errors: a setting and confirm.set may not go together
     return folder / f"{name}.yaml"

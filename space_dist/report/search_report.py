@@ -270,7 +270,7 @@ def _confirmation(grid: Grid, manifest: Manifest, search: Search, out: Path) -> 
         return [], f"{none}: {error}."
     if fault := _not_of_this(found, manifest, search):
         return [], f"{none}: {confirming.folder} {fault}; `space-dist tune confirm {grid.folder}` writes it anew."
-    made = build_grid_report(confirming, out / "confirmation")
+    made = build_grid_report(confirming, out / "confirmation", in_depth=False)
     curves = made.folder / "curves.png"
     pictures = [
         Picture("confirmation.png", "Learning curves of the confirmation", curves.read_bytes())
