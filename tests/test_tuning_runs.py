@@ -37,18 +37,15 @@ def tiny_tune(folder: Path, **sections: Any) -> Path:
 
 
 @pytest.fixture(scope="module")
-def left_alone(tmp_path_factory: pytest.TempPathFactory) -> Grid:
-    """A search with racing that nobody disturbed, one run after the other."""
+def left_alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Grid]:
+    """The file of a search with racing, and that search, which nobody disturbed, one process after the other."""
     folder = tmp_path_factory.mktemp("left_alone")
-    return run_search(racing(folder), root=folder / "runs", max_parallel=1, progress=False).grid
+    path = tiny_tune(folder, pruner={"rungs": [1], "keep": 0.5})
+    return path, run_search(path, root=folder / "runs", max_parallel=1, progress=False).grid
 
 
-def racing(folder: Path) -> Path:
-    return tiny_tune(folder, pruner={"rungs": [1], "keep": 0.5})
-
-
-def test_trials_train_and_are_told(left_alone: Grid) -> None:
-    manifest = left_alone.manifest()
+def test_trials_train_and_are_told(left_alone: tuple[Path, Grid]) -> None:
+    manifest = left_alone[1].manifest()
     assert manifest.search is not None
     assert manifest.search.over
     states = [[trial.state for trial in manifest.search.of_arm(arm)] for arm in manifest.search.arms]
@@ -57,10 +54,10 @@ def test_trials_train_and_are_told(left_alone: Grid) -> None:
     assert all(cell.stack for cell in manifest.cells)  # which share processes
 
 
-def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: Grid, tmp_path: Path) -> None:
+def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: tuple[Path, Grid], tmp_path: Path) -> None:
     """SIGKILL to the command and all that it has started; other numbers of workers each time."""
-    path, root, moments = racing(tmp_path), tmp_path / "runs", random.Random(0)
-    killed = 0
+    path, undisturbed = left_alone
+    root, moments, killed = tmp_path / "runs", random.Random(0), 0
     for attempt in range(4 * KILLS):
         command = [sys.executable, "-m", "space_dist.cli", "tune", "run", path, "--root", root,
                    "--max-parallel", str(1 + attempt % 3)]  # fmt: skip
@@ -78,7 +75,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: Grid, 
             end_session(process)
     assert killed >= 2
     assert process.returncode == 0
-    assert (root / "search/manifest.json").read_bytes() == left_alone.manifest_file.read_bytes()
+    assert (root / "search/manifest.json").read_bytes() == undisturbed.manifest_file.read_bytes()
 
 
 def progress(root: Path) -> int:
