@@ -80,8 +80,7 @@ def draw_panels(panels: Sequence[Panel]) -> Figure:
     """Test returns over real environment steps: IQMs over seeds with bands of 95 %, on axes of one scale."""
     columns = min(_PANEL_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
-    longest = max(len(panel.configurations) for panel in panels)
-    figure = empty_figure(5.0 * columns, (3.6 + 0.24 * longest) * rows)
+    figure = empty_figure(5.0 * columns, (3.6 + 0.17 * max(map(_legend_lines, panels))) * rows)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         if panel.reference is not None:
@@ -92,10 +91,16 @@ def draw_panels(panels: Sequence[Panel]) -> Figure:
             _draw_returns(axes, *configuration.returns("test"), _legend(configuration, _PANEL_LABEL), style)
         _dress(axes, plain(panel.title), _RETURN_LABEL)
         axes.tick_params(labelbottom=True, labelleft=True)
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), frameon=False, fontsize=8)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), frameon=False, fontsize=8, handlelength=3)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     return figure
+
+
+def _legend_lines(panel: Panel) -> int:
+    """Lines of a panel's legend, below its axes."""
+    shown = [*panel.configurations, *([panel.reference] if panel.reference is not None else [])]
+    return sum(_legend(configuration, _PANEL_LABEL).count("\n") + 1 for configuration in shown)
 
 
 @dataclass(frozen=True)
