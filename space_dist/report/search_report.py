@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.manifest import Cell, Grid, Manifest
@@ -184,7 +185,8 @@ def draw_trials(search: Search) -> Figure:
                 axes.scatter([trial.number for trial in found], values, s=26, facecolor=filled, edgecolor=colour,
                              marker="os^Dv"[number % 5], label=label)  # fmt: skip
     axes.set_xlabel("trial")
-    axes.set_ylabel(str(search.config["objective"]["kind"]))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylabel(f"objective: {search.config['objective']['kind']}, over seeds")
     dress(axes, "What the search saw, on the development instances")
     axes.legend(frameon=False, fontsize=8)
     return figure
