@@ -50,9 +50,10 @@ collect_seldom()
 # Files that take longest, from the longest on: minutes of waiting, of emulating, or of both.
 _LONGEST = (
     "chaos/test_chaos", "test_golden_intel", "test_golden_amd", "test_slurm_cluster", "test_determinism",
-    "test_grid_cluster", "test_lean_replay", "test_learners", "faults/test_parts", "test_grid_tracking",
-    "faults/test_every_write", "faults/test_ray_itself", "test_importing", "faults/test_endings", "test_rival_runs",
-    "test_actors", "test_distributed", "faults/test_owners_and_disks", "faults/test_requests", "faults/test_damage",
+    "test_grid_cluster", "test_site_cluster", "test_lean_replay", "test_learners", "faults/test_parts",
+    "test_grid_tracking", "faults/test_every_write", "faults/test_ray_itself", "test_importing",
+    "faults/test_endings", "test_rival_runs", "test_actors", "test_distributed", "faults/test_owners_and_disks",
+    "faults/test_requests", "faults/test_damage",
 )  # fmt: skip
 
 

@@ -98,6 +98,7 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (["instances", "sample", "pointmass_unifrom", "--out", "x"], ["did you mean 'pointmass_uniform'?"]),
         (["instances", "check", "nowhere.csv"], ["nowhere.csv"]),
         (["instances", "check", str(TRAIN), str(TRAIN)], ["overlap"]),
+        (["instances", "check", str(ROOT / "configs/instances/cartpole_train.csv")], ["length", "--env names another"]),
     ],
     ids=lambda value: " ".join(map(str, value[-1:])) if isinstance(value, list) else None,
 )

@@ -256,6 +256,9 @@ def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
     grid, manifest = (made := plan(path, tmp_path / "runs")).grid, made.manifest
     for name in (path, grid.folder, grid.manifest_file):
         assert find_grid(name, tmp_path / "runs").folder == grid.folder
+    assert find_grid(Path(grid.folder.name), tmp_path / "runs").folder == grid.folder  # by its name
+    with pytest.raises(ConfigError, match="is frozen already"):
+        find_grid(Path(grid.folder.name), tmp_path / "runs", 0.5)
     cell = manifest.cells[1]
     assert manifest.cell("kappa=4") == manifest.cell(cell.id) == manifest.cell(cell.id[:6]) == cell
     with pytest.raises(ConfigError, match="did you mean 'kappa=4'"):

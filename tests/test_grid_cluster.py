@@ -16,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import Grid, Run
 from space_dist.experiment.status import Attempts
 from space_dist.grid.planning import plan
@@ -141,6 +142,14 @@ def test_a_dead_job_server_is_one_clear_sentence(cluster: RayHead, tmp_path: Pat
     assert submit.returncode == 1
     assert "does not answer" in said
     assert "Traceback" not in said
+
+
+def test_an_address_that_is_no_urls_is_refused_at_once(tmp_path: Path) -> None:
+    from space_dist.grid.jobs import Remote
+
+    manifest = plan(write_grid(tmp_path), tmp_path / "runs").manifest
+    with pytest.raises(ConfigError, match="'head:8265' is no job server: http://HOST:PORT"):
+        Remote("head:8265", manifest, tmp_path / "runs")
 
 
 def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(

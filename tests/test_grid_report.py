@@ -559,6 +559,7 @@ def test_the_command_knows_a_grid(
         ([grid.folder, "--baseline", "e"], "grid has no cell 'e'"),
         ([grid.manifest_file, "--baseline", "e"], "grid has no cell 'e'"),
         ([grid.folder, tmp_path], "is a grid: give it alone"),
+        ([grid.folder, "kappa=1", "--baseline", "space"], "goes in quotes: --baseline 'space kappa=1'"),
         ([tmp_path, "--threshold", 3], "are for grids"),
         ([grid.folder, "--threshold", "nan"], "must be a finite number"),
     ):

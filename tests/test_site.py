@@ -1,16 +1,14 @@
 """The pages as a site, and what they tell people to type.
 
-Executed here, in one folder and with small budgets: the commands of docs/training.md that need neither Ray nor MLflow
-nor a module of one's own (train, go on, evaluate, export, report, instances), those of any page that plan or export a
-grid, and what lists or explains configs (`EXECUTED`). Python, YAML and commands of docs/python.md, docs/sb3.md and the
-three pages about what is one's own are executed by tests of their own (`ELSEWHERE`).
+Every block that one types is executed as a whole: see tests/test_site_commands.py, which names the files, and sees to
+it that none is left out. Python, YAML and commands of docs/python.md, docs/sb3.md and the three pages about what is
+one's own are executed by tests of their own (`ELSEWHERE`).
 
-Only parsed: all other commands of `space-dist`, `jobs/*.py` and `ray` that a block of README.md or docs/*.md has. Their
-sub-commands, options and types are checked by the command's own parser, files that begin with `configs/` or `jobs/`
-and names that begin with `shipped:` must exist, and what `--set` sets must be a key with such a value. Targets of
-`make` must exist. Words in capitals stand for something. Nothing is said of `pip`, `git`, `ssh`, pipes and loops
-around commands, nor of what commands print, but for the numbers of the quickstart (tests/test_quickstart.py) and the
-sentences of docs/faq.md.
+Here all commands of `space-dist`, `jobs/*.py` and `ray` are held against their own parsers, and not in small:
+sub-commands, options and types, files that begin with `configs/` or `jobs/` and names that begin with `shipped:` must
+exist, and what `--set` sets must be a key with such a value. Targets of `make` must exist. Words in capitals stand for
+something. Those that are cheap are executed on the shipped files themselves (`EXECUTED`). Nothing is said of what
+commands print, but for the numbers of the quickstart (tests/test_quickstart.py) and the sentences of docs/faq.md.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from space_dist.slurm import Export, Profile
 from space_dist.slurm import export as write_scripts
 from space_dist.slurm.export import AGGREGATE, JOBS, TRAIN, render
 from tests.patience import PATIENCE
+from tests.shell import bash_blocks, executes, write_small_configs
 from tests.slurm.gated_env import GATE
 from tests.slurm.profiles import FIELDS, RESERVATION, exports
 from tests.test_grid_tracking import everything
@@ -270,6 +271,31 @@ def test_an_array_survives_preemption_and_its_time_limit(
     assert "(0 new, 0 rows pushed)" in space_dist("sync", folder)
     for node in (1, 2):
         await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
+
+
+@executes(("slurm.md", 0))
+def test_what_the_page_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> None:
+    """Its block, on configs in small and with a profile of this Slurm; what it submits is held, and taken back."""
+    write_small_configs(tmp_path / "configs")
+    (tmp_path / "configs/slurm/site.yaml").write_text(to_yaml({"mem": 1500, "temp": "/var/tmp"}))  # noqa: S108
+    [script] = bash_blocks("slurm.md")
+    for old, new in (("/shared", f"{tmp_path}/shared"), ("submit.sh ", "submit.sh --hold "),
+                     ("\nspace-dist grid status", "\nspace-dist grid status --json")):  # fmt: skip
+        assert old in script
+        script = script.replace(old, new)
+    command = f"{sys.executable} -P -m space_dist.cli"
+    done = subprocess.run(
+        ["bash", "-c", f'set -e\nspace-dist() {{ {command} "$@" || [ $? = 3 ]; }}\n{script}'],
+        cwd=tmp_path, env=slurm.environment, capture_output=True, text=True, timeout=PATIENCE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "sbatch --test-only: no objection" in done.stdout
+    told = json.loads(done.stdout[done.stdout.index("{") :])
+    assert (told["grid"], told["counts"]) == ("pointmass_small", {"waiting": 2})
+    jobs = [line.split()[0] for line in (tmp_path / "shared/pointmass_small" / JOBS).read_text().splitlines()]
+    assert len(jobs) == 2
+    assert slurm.job(jobs[0])["JobState"] == "PENDING"
+    slurm.ask("scancel", *jobs)
 
 
 def test_a_failing_cell_blocks_nothing_and_is_named(slurm: Slurm, tmp_path: Path) -> None:

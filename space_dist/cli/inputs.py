@@ -48,7 +48,10 @@ def instances_sample(
 @instances_app.command("check")
 def instances_check(
     files: Annotated[list[Path], typer.Argument(help="CSV files; given two, they must not share a context.")],
-    env: Annotated[str, typer.Option(help="The environment whose contexts these are.")] = "space_dist/PointMass-v0",
+    env: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="The environment whose contexts these are. Default: space_dist/PointMass-v0."),
+    ] = None,
     kwarg: Kwargs = None,
     columns: Annotated[
         Optional[list[str]],  # noqa: UP045
@@ -60,9 +63,17 @@ def instances_check(
     from space_dist.envs.spec import read_spec
     from space_dist.instances import read_csv, refuse_overlap, summary
 
-    bounds = read_spec(env, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
+    known = env or "space_dist/PointMass-v0"
+    bounds = read_spec(known, context_visible=False, kwargs=parse_kwargs(kwarg)).context_bounds
     files = [located(file) for file in files]
-    sets = [read_csv(file, bounds, columns or (), if_there=True) for file in files]
+    try:
+        sets = [read_csv(file, bounds, columns or (), if_there=True) for file in files]
+    except ConfigError as error:
+        if env is not None or not all(file.is_file() for file in files):
+            raise
+        raise ConfigError(
+            f"{error}. They were taken for contexts of {known}: --env names another environment"
+        ) from None
     for index, one in enumerate(sets):
         for other in range(index):
             refuse_overlap(sets[other], one, str(files[other]), str(files[index]))

@@ -204,6 +204,9 @@ def report(
         grid = _grid(paths[0], root, scale)
         print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
         return
+    if baseline is not None and (absent := [str(path) for path in paths if not path.exists()]):
+        label = " ".join([baseline, *absent])
+        raise ConfigError(f"{absent[0]} does not exist; a label of several words goes in quotes: --baseline '{label}'")
     if grids := [path for path in paths if is_grid(path)]:
         raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
     if baseline is not None or threshold is not None or scale != 1.0:

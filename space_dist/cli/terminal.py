@@ -93,7 +93,15 @@ def delivered() -> None:
 
 from space_dist.system.interrupts import StopRequests
 
-STOP = StopRequests()
+
+def _told_at_once(sentence: str) -> None:
+    """To standard error, from within a signal's handler: nothing that is buffered may be touched, nor may it wait."""
+    with contextlib.suppress(OSError, ValueError):
+        if select.select([], [2], [], 0)[1]:
+            os.write(2, f"space-dist: {sentence}\n".encode())
+
+
+STOP = StopRequests(tell=_told_at_once)
 
 from collections.abc import Sequence
 from pathlib import Path

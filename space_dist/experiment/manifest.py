@@ -512,11 +512,14 @@ class Grid:
 
 
 def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
-    """The grid that a user names: its folder, its manifest.json, or its YAML file (frozen below `root`, at a scale).
+    """The grid that a user names: its folder, its manifest.json, its name below `root`, or its YAML file (frozen below
+    `root`, at a scale).
 
     Raises ConfigError if there is nothing of the kind, and for a scale of what is frozen already; LedgerError if a YAML
     file's grid was never frozen.
     """
+    if not path.exists() and len(path.parts) == 1 and Grid(root / path).manifest_file.exists():
+        path = root / path
     if scale != scaling.WHOLE and (path.is_dir() or path.name == MANIFEST):
         raise ConfigError(f"{path} is frozen already, with its seeds and steps; --scale is for a grid's YAML file")
     if path.is_dir():

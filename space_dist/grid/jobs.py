@@ -28,7 +28,7 @@ import ray
 import requests
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
-from space_dist.errors import Interrupted, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.experiment.endings import Busy, Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import Attempts, RunStatus, settled
@@ -400,6 +400,8 @@ def _while_away(address: str) -> Iterator[None]:
 
 
 def _client(address: str) -> JobSubmissionClient:
+    if not address.startswith(("http://", "https://")):  # Ray would try it as that of the cluster itself, for a minute
+        raise ConfigError(f"--address {address!r} is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
     try:
         return JobSubmissionClient(address)
     except (ConnectionError, RuntimeError, ValueError, requests.RequestException) as error:

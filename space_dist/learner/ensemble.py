@@ -61,11 +61,11 @@ class Ensemble:
         sizes = [size, *learner.net_arch, 1]
         self._parameters: list[torch.Tensor] = []
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
-            hidden = layer < len(learner.net_arch)
+            is_hidden = layer < len(learner.net_arch)
             weight = torch.empty(settings.members, n_in, n_out)
             for member in weight:
                 # SB3's gains of an actor-critic's hidden layers and of its value.
-                torch.nn.init.orthogonal_(member, gain=np.sqrt(2.0) if hidden else 1.0, generator=random)
+                torch.nn.init.orthogonal_(member, gain=np.sqrt(2.0) if is_hidden else 1.0, generator=random)
             self._parameters += [weight.requires_grad_(), torch.zeros(settings.members, 1, n_out, requires_grad=True)]
         # eps: SB3's for actor-critics.
         self._optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, eps=1e-5)

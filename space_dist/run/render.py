@@ -136,7 +136,8 @@ class Gallery:
             if len(places) != 1:
                 held = "; ".join(f"{split}: {_ranges(self._sets[split].ids)}" for split in _SPLITS)
                 where = "neither set of the run" if not places else "both sets of the run"
-                raise ConfigError(f"--instances: {wanted} is the id of an instance of {where} (ids of {held})")
+                mend = "; only ids that one set alone has can be chosen" if places else ""
+                raise ConfigError(f"--instances: {wanted} is the id of an instance of {where} (ids of {held}){mend}")
             found += places
         return found
 

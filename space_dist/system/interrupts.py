@@ -6,7 +6,7 @@ import atexit
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -30,9 +30,12 @@ class StopRequests:
     the same exit code. A second SIGINT ends it at once.
     """
 
-    def __init__(self, shared: StopRequests | None = None) -> None:
-        """shared: whose signals also ask this one; its file does not."""
-        self._shared = shared
+    def __init__(self, shared: StopRequests | None = None, tell: Callable[[str], None] = lambda sentence: None) -> None:
+        """shared: whose signals also ask this one; its file does not.  tell: where somebody waits for an answer.
+
+        `tell` is called by signal handlers and threads.
+        """
+        self._shared, self._tell = shared, tell
         self._reason: str | None = None
         self._file: Path | None = None
         self._grace_seconds = 25.0
@@ -90,6 +93,11 @@ class StopRequests:
                 os._exit(Interrupted.exit_code)
             return
         self._reason = signal.Signals(number).name
-        timer = threading.Timer(self._grace_seconds, os._exit, (Interrupted.exit_code,))
+        self._tell(f"{self._reason}: ending with a checkpoint, which takes up to {self._grace_seconds:g} s")
+        timer = threading.Timer(self._grace_seconds, self._give_up)
         timer.daemon = True
         timer.start()
+
+    def _give_up(self) -> None:
+        self._tell(f"that took too long: ended on the last checkpoint (exit code {Interrupted.exit_code})")
+        os._exit(Interrupted.exit_code)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -98,6 +99,9 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
         process.kill()
     assert process.exitcode == 75, said.read_text()
     assert "Traceback" not in said.read_text()
+    first, last = re.findall(r"^space-dist: (.*)$", said.read_text(), re.MULTILINE)
+    assert first == "SIGUSR1: ending with a checkpoint, which takes up to 0.3 s"
+    assert last == "that took too long: ended on the last checkpoint (exit code 75)"
     status = Ledger(tmp_path / "run").status()
     assert status.checkpoint == "round-000000002.npz"
     config = configs.load(tmp_path / "config.yaml", ["evaluation.every_steps=100000"])

@@ -1,0 +1,161 @@
+"""The benchmarks that pages have one type: executed by bash as they are written, with their smallest sizes.
+
+`kernel`, `off-policy` and `equivalence` measure, a few minibatches and runs. `throughput` searches, counts rounds,
+draws its table and keeps its files, while what its processes answer is made up: they take minutes, and
+tests/test_throughput.py has them. `chaos` is asked what it is asked, and tests/chaos/test_chaos.py rehearses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from tests.commanding import command
+from tests.grids import ROOT
+from tests.shell import Shell, executes, one_supervisor
+
+sys.path.append(str(ROOT / "jobs"))
+
+import benchmark
+from benchmarks import chaos, contenders, equivalence, kernel, off_policy, throughput
+from benchmarks.faults import KINDS, Fault, Hit, Result
+
+
+class Bench(Shell):
+    """A shell whose `python jobs/benchmark.py` is done in this process."""
+
+    more: tuple[str, ...] = ()
+
+    def command(self, words: list[str]) -> int:
+        if words[:2] != ["python", "jobs/benchmark.py"]:
+            return super().command(words)
+        self._patch.chdir(self.folder)
+        try:
+            typer.main.get_command(benchmark.app)([*words[2:], *self.more], prog_name="benchmark.py")
+        except SystemExit as error:
+            return int(error.code or 0)
+        return 0
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    clone = tmp_path / "clone"
+    clone.mkdir()
+    found = Bench(clone, monkeypatch)
+    yield found
+    assert set(found.done) == set(request.function.executes)
+
+
+@executes(("performance.md", 1), ("performance.md", 2))
+def test_kernels(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(kernel, "SHAPES", {(64, 64): 64})
+    bench.more = ("--rounds", "1")
+    bench.block("performance.md", 1)
+    assert "64-64, minibatch 64: compiled " in capsys.readouterr().out
+    works = off_policy._works
+    monkeypatch.setattr(off_policy, "_works", lambda steps: {
+        kind: dataclasses.replace(work, settings=(
+            *work.settings, "learner.learning_starts=100", "learner.gradient_steps_per_step=0.1", "budget.steps=512",
+            "evaluation.every_steps=512",
+        )) for kind, work in works(steps).items()
+    })  # fmt: skip
+    bench.more = ("--rounds", "1", "--steps", "512")
+    bench.block("performance.md", 2)
+    assert "ratio of gradient" in capsys.readouterr().out
+
+
+@executes(("performance.md", 3))
+def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Three runs an arm, by one process."""
+    for name, value in {"PILOT": range(9000, 9003), "FEWEST": 3, "MOST": 3}.items():
+        monkeypatch.setattr(equivalence, name, value)
+
+    ran = subprocess.run
+
+    def run(words: list[str], **how: Any) -> Any:
+        if words[:3] != [sys.executable, "-m", "space_dist.cli"]:
+            return ran(words, **how)
+        assert how == {"stdout": subprocess.DEVNULL, "check": False}
+        return subprocess.CompletedProcess(words, command(monkeypatch, *words[3:]))
+
+    monkeypatch.setattr(equivalence.subprocess, "run", run)
+    bench.more = ("--steps", "4096", "--max-parallel", "1")
+    codes: list[int] = []
+
+    def answer(words: list[str]) -> int:
+        codes.append(bench.command(words))
+        return 0  # that so few are not shown to be equal is no fault
+
+    with one_supervisor(bench.folder):
+        bench.block("performance.md", 3, {"/tmp/equivalence": str(bench.folder / "kept")}, answer=answer)  # noqa: S108
+    told = capsys.readouterr().out
+    assert "PointMass, round_robin, 4,096 steps, the same 3 seeds" in told
+    assert codes == [0 if "yes" in told else 1]
+    assert len(list((bench.folder / "kept").glob("*/*/s*/model.npz"))) == 9
+
+
+@executes(("performance.md", 0))
+def test_throughput(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everybody is as fast as they are many, and what they are asked is what a process of `contenders` takes."""
+    asked: list[dict[str, Any]] = []
+    fields = {field.name for field in dataclasses.fields(contenders.Contender)}
+
+    def found(wanted: list[tuple[str, contenders.Contender]], patience: float | None = None) -> list[dict[str, float]]:
+        assert patience is None or patience > 0
+        given = [json.loads(specification) for specification, _ in wanted]
+        assert all(one["task"] in contenders.TASKS and {*one["contender"]} == fields for one in given)
+        asked.extend(given)
+        return [{"rate": 1000.0 * len(asked)} for _ in wanted]
+
+    monkeypatch.setattr(throughput, "_together", found)
+    monkeypatch.setattr(
+        throughput, "process", lambda *_: dict.fromkeys(("kernel", "batched", "single", "arithmetic"), 1e-5)
+    )
+    monkeypatch.setattr(throughput, "_grid_seconds", lambda *_: 1.0)
+    monkeypatch.setattr(throughput, "_missing", lambda: [*throughput.EXTRA])
+    codes: list[int] = []
+
+    def answer(words: list[str]) -> int:
+        codes.append(bench.command(words))
+        return 0  # that somebody is slower than wanted is no fault of the command
+
+    # The clone's own history, where the commit of the page is.
+    for words in (["clone", "-q", "--no-checkout", str(ROOT), "history"],):
+        subprocess.run(["git", *words], cwd=bench.folder, check=True)
+    shutil.move(bench.folder / "history/.git", bench.folder / ".git")
+    bench.block("performance.md", 0, prelude='pip() { echo "not done: pip $*"; }\n', answer=answer)
+    assert len(codes) == 4
+    assert set(codes) <= {0, 1}
+    assert {one["task"] for one in asked} == {*contenders.TASKS}
+    for name in ("throughput/throughput.md", "throughput/throughput.png", "throughput.json", "settings.json"):
+        assert (bench.folder / name).is_file()
+    before = [one["contender"] for one in asked if one["contender"]["checkout"]]
+    assert {one["checkout"] for one in before} == {str((bench.folder.parent / "before").resolve())}
+    assert (bench.folder.parent / "before/space_dist/__init__.py").is_file()
+
+
+@executes(("recovery.md", 0))
+def test_chaos(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """What `rehearse` is asked for: tests/chaos/test_chaos.py asks it for less."""
+    wanted, rehearse = [], inspect.signature(chaos.rehearse)
+
+    def rehearsed(**how: Any) -> Result:
+        wanted.append(rehearse.bind(**how).arguments)
+        hit = Hit(Fault(KINDS[0], 1.0, 0.0, 0.0, 0.5), "run", 1.0, 2.5)
+        return Result(hits=[hit], runs=how["runs"], identical=how["runs"], submissions=1)
+
+    monkeypatch.setattr(chaos, "rehearse", rehearsed)
+    bench.block("recovery.md", 0)
+    assert [(one["count"], one["runs"], len(one["kinds"])) for one in wanted] == [(50, 8, 14), (50, 8, 10)]
+    assert [one["settings"].get("engine") for one in wanted] == [None, "population"]
+    assert capsys.readouterr().out.count(KINDS[0]) == 2
