@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from space_dist.api.policies import ActingPolicy, load_policy
     from space_dist.api.reports import ReportView, report_on
     from space_dist.api.training import Run, train
+    from space_dist.api.tuning import run_search
     from space_dist.config import RunConfig
     from space_dist.instances import InstanceSet
     from space_dist.sb3 import ContextVecEnv, CurriculumCallback
@@ -45,6 +46,7 @@ __all__ = [
     "load_policy",
     "report_on",
     "run_grid",
+    "run_search",
     "train",
 ]
 
@@ -60,6 +62,7 @@ _HOMES = {
     "load_policy": "space_dist.api.policies",
     "report_on": "space_dist.api.reports",
     "run_grid": "space_dist.api.grids",
+    "run_search": "space_dist.api.tuning",
     "train": "space_dist.api.training",
 }
 

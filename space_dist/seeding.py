@@ -42,6 +42,7 @@ class Purpose(enum.IntEnum):
     ENSEMBLE_UPDATE = 17
     MEMBERS = 18
     CUSTOM = 19
+    TRIALS = 20
 
 
 def seed_sequence(seed: int, purpose: Purpose, *keys: int) -> np.random.SeedSequence:

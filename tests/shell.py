@@ -185,6 +185,10 @@ def in_small(data: dict[str, Any], source: Path) -> dict[str, Any]:
     settings = {"budget.steps": steps, "evaluation.every_steps": steps}
     if isinstance(data["extends"], str) and "dqn" not in data["extends"]:
         settings |= {"learner.n_steps": STEPS // 2, "learner.n_epochs": 1}
+    if "trials" in data:  # a search
+        confirm = data["confirm"] | {"seeds": [1000]}
+        return data | {"set": data["set"] | settings, "trials": 2, "generation": 1, "seeds": [0], "confirm": confirm,
+                       "tracking": {"uri": None}}  # fmt: skip
     kept = {name: value for name, value in data.items() if name not in ("grid", "exclude", "baseline")}
     return kept | {"set": data.get("set", {}) | settings, "zip": few, "seeds": [0], "tracking": {"uri": None}}
 

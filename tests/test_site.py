@@ -33,6 +33,7 @@ from mkdocs.config import load_config
 from space_dist import cli, config
 from space_dist.config.shipped import located
 from space_dist.experiment.manifest import GridConfig, load_grid
+from space_dist.experiment.tuning import TuneConfig, is_search
 from space_dist.slurm.profile import load_profile
 from tests.commanding import command
 
@@ -298,7 +299,7 @@ def test_yaml_of_a_page_is_taken_by_the_schema(page: str, text: str, tmp_path: P
     (tmp_path / "snippet.yaml").write_text(text)
     data = config.read_yaml(tmp_path / "snippet.yaml")
     if "seeds" in data:
-        config.check(GridConfig, data, page)
+        config.check(TuneConfig if is_search(data) else GridConfig, data, page)
         return
     base = config.read(ROOT / "configs/pointmass_space.yaml")
     config.parse(data if "budget" in data else base | data, page)

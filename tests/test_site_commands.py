@@ -157,6 +157,13 @@ def test_curricula_and_results(shell: Shell) -> None:
                      "paper-pointmass-multiply-scale-0.02"}  # fmt: skip
 
 
+@executes(("tuning.md", 0))
+def test_tuning(shell: Shell) -> None:
+    shell.block("tuning.md", 0)
+    assert (shell.folder / "runs/pointmass_tuned/report/report.md").is_file()
+    assert (shell.folder / "runs/pointmass_tuned-confirm").is_dir()
+
+
 @executes(("reports.md", 0))
 def test_reports(shell: Shell) -> None:
     """Of the grid of the pages, which is run for it."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from space_dist.api.progress import line_of_grid, shown
+from space_dist.errors import ConfigError
 from space_dist.experiment import manifest as manifests
 from space_dist.experiment import scaling
 from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
@@ -112,7 +113,10 @@ def frozen(path: Path, root: Path, scale: float = scaling.WHOLE) -> tuple[Grid, 
     if path.is_dir() or path.name == MANIFEST:
         source = find_grid(path, root, scale)
         place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
-        return place, place.manifest()
+        manifest = place.manifest()
+        if manifest.search is not None:
+            raise ConfigError(f"{place.folder} holds a search: space-dist tune run {place.folder}")
+        return place, manifest
     from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
 
     made = plan(path, root, scale)

@@ -18,6 +18,7 @@ from space_dist.cli.grids import grid_app
 from space_dist.cli.health import doctor
 from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
+from space_dist.cli.tuning import tune_app
 from space_dist.cli.worlds import env_app, render
 from space_dist.errors import SpaceDistError
 from space_dist.system.importing import look_here_too
@@ -33,6 +34,7 @@ for _command in (
 ):  # fmt: skip
     app.command()(_command)
 app.add_typer(grid_app, name="grid")
+app.add_typer(tune_app, name="tune")
 app.add_typer(slurm_app, name="slurm")
 app.add_typer(instances_app, name="instances")
 app.add_typer(config_app, name="config")

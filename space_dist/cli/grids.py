@@ -58,13 +58,13 @@ def grid_plan(grid: GridPath, root: Root = None, scale: Scale = 1.0, as_json: Js
     from space_dist.grid.planning import plan
     from space_dist.system.provenance import code_digest
 
-    made = plan(grid, _root(root), scale)
+    made = plan(grid, root_of(root), scale)
     manifest = made.manifest
     found = run_statuses(made.grid, manifest, code_digest())
     done = [run_status for run_status in found if run_status.condition == "done"]
     left = sum(run_status.budget_steps for run_status in found) - sum(run_status.steps for run_status in found)
     if as_json:
-        _print_json({
+        print_json({
             "grid": manifest.name, "folder": str(made.grid.folder), "seeds": list(manifest.seeds), "runs": len(found),
             "cpus_per_run": manifest.cpus_per_run, "steps": made.steps, "steps_left": left, "done": len(done),
             "new_runs": made.new_runs, "dropped_runs": made.dropped_runs,
@@ -119,11 +119,11 @@ def grid_run(
     ] = None,
 ) -> None:
     """Work through a grid: skip what is done, go on with what is not, retry by cause."""
-    chosen = _mode(mode)
-    _prepare(address)
+    chosen = mode_of(mode)
+    prepare(address)
     from space_dist.api.grids import frozen
 
-    place, manifest = frozen(grid, _root(root), scale)
+    place, manifest = frozen(grid, root_of(root), scale)
     if digest is not None and digest != manifest.runs_digest:
         raise ConfigError(
             f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
@@ -162,9 +162,9 @@ def grid_submit(
         from space_dist.grid.jobs import Remote
     from space_dist.api.grids import frozen
 
-    chosen = _mode(mode)
+    chosen = mode_of(mode)
     limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
-    base = _root(root)
+    base = root_of(root)
     place, manifest = frozen(grid, base, scale)
     remote = Remote(address, manifest, base)
     job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
@@ -173,7 +173,7 @@ def grid_submit(
         say(f"`space-dist grid status {place.folder}` tells how far it is, `grid submit` again looks on")
         return
     code = remote.follow(job, say, STOP.reason)
-    found = _run_statuses(place, manifest)
+    found = run_statuses_of(place, manifest)
     if not any(run_status.attempts or run_status.steps for run_status in found):
         warn(
             f"{place.folder} shows no run of it: it is not on the cluster's storage. What is seen from here is "
@@ -204,9 +204,9 @@ def grid_status(
     while True:
         if time.monotonic() - asked >= _QUEUE_SECONDS:  # a controller serves everybody
             queue, asked = queue_of(place.folder), time.monotonic()
-        found = _run_statuses(place, manifest)
+        found = run_statuses_of(place, manifest)
         if as_json:
-            _print_json(status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
+            print_json(status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
             if watch and console.is_terminal:
                 console.clear()
@@ -234,7 +234,7 @@ def grid_logs(
     ledger = place.ledger(run)
     offsets = {ledger.log: 0, ledger.folder / OUTPUT: 0}
     while True:
-        [run_status] = _run_statuses(place, manifest, [run])
+        [run_status] = run_statuses_of(place, manifest, [run])
         for path in offsets:
             offsets[path] = _print_from(path, offsets[path])
         if not follow or output_left() or run_status.condition in ("done", "failed"):
@@ -263,7 +263,7 @@ def grid_stop(
         remote.stop(str(conductor.submission_id))
         say(f"{manifest.name}: job {conductor.submission_id} was asked to stop its runs, and itself")
         return
-    live = [run_status for run_status in _run_statuses(place, manifest) if run_status.condition == "running"]
+    live = [run_status for run_status in run_statuses_of(place, manifest) if run_status.condition == "running"]
     queue = queue_of(place.folder)
     if not live and not place.owner_alive() and not (queue and queue.live):
         say(f"{manifest.name}: nothing is running")
@@ -291,7 +291,7 @@ def grid_retry(
     for name in sorted(causes):
         one_of(known, name, "--cause")
     place, manifest = _found(grid, root)
-    chosen = [run_status for run_status in _run_statuses(place, manifest)
+    chosen = [run_status for run_status in run_statuses_of(place, manifest)
               if run_status.condition == "failed" and run_status.cause in causes]  # fmt: skip
     for run_status in chosen:
         Attempts(run_status.ledger).forgive()
@@ -341,12 +341,12 @@ def run_frozen(
     nodes: int = 1, part: str | None = None,
 ) -> list[RunStatus]:  # fmt: skip
     """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
-    _prepare(address)
+    prepare(address)
     from space_dist.api.grids import worked_through
     from space_dist.grid.conductor import working_on
 
     runs = _part(manifest.runs(), part)
-    _log_to(place)
+    log_to(place)
     with contextlib.ExitStack() as stack:
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
@@ -360,7 +360,7 @@ def run_frozen(
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
 
-def _prepare(address: str) -> None:
+def prepare(address: str) -> None:
     """What must come before Ray, and anything else that is heavy, is imported."""
     STOP.install()
     if address == "local":
@@ -369,7 +369,8 @@ def _prepare(address: str) -> None:
         private_ray()
 
 
-def _root(root: Path | None) -> Path:
+def root_of(root: Path | None) -> Path:
+    """The folder that holds the grids' folders."""
     from space_dist.system.workplace import lasting, workplace
 
     return workplace() / "runs" if root is None else lasting(root, "--root")
@@ -379,11 +380,12 @@ def _found(path: Path, root: Path | None, scale: float = 1.0) -> tuple[Grid, Man
     """A grid that was frozen before, however the user names it."""
     from space_dist.experiment.manifest import find_grid
 
-    place = find_grid(path, _root(root), scale)
+    place = find_grid(path, root_of(root), scale)
     return place, place.manifest()
 
 
-def _mode(text: str) -> Mode:
+def mode_of(text: str) -> Mode:
+    """What `--mode` was given. Raises ConfigError if there is no such mode."""
     return cast("Mode", one_of(_MODES, text, "--mode"))
 
 
@@ -404,14 +406,16 @@ def _part(runs: list[Run], part: str | None) -> list[Run]:
     return runs[int(first) : int(last) + 1]
 
 
-def _run_statuses(place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None) -> list[RunStatus]:
+def run_statuses_of(place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None) -> list[RunStatus]:
+    """Where the runs of a grid stand now."""
     from space_dist.experiment.status import run_statuses
     from space_dist.system.provenance import code_digest
 
     return run_statuses(place, manifest, code_digest(), runs)
 
 
-def _log_to(place: Grid) -> None:
+def log_to(place: Grid) -> None:
+    """Have what happens to the runs stand in the grid's log, too."""
     log = logging.getLogger("space_dist")
     log.setLevel(logging.INFO)
     with contextlib.suppress(OSError):
@@ -445,7 +449,8 @@ def _remote_status(place: Grid, manifest: Manifest, address: str) -> int:
     return conductor.driver_exit_code or 0
 
 
-def _print_json(data: dict[str, Any]) -> None:
+def print_json(data: dict[str, Any]) -> None:
+    """What a command was asked for as JSON. Raises SpaceDistError if it is lost."""
     print(json.dumps(data, indent=1))
     delivered()
 

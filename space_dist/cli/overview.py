@@ -117,6 +117,9 @@ def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
     for run_status in found:
         of_cell[run_status.run.cell.id].append(run_status)
     rows = [_cell_row(cell, of_cell[cell.id]) for cell in manifest.cells]
+    if not rows:  # a search all of whose settings were refused so far
+        say(f"{manifest.name} has no cells yet")
+        return
     table = Table(title=Text(manifest.name), title_justify="left")
     for column in rows[0]:
         table.add_column(column, justify="left" if column in ("cell", "id") else "right", no_wrap=True)

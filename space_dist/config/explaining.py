@@ -117,7 +117,12 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
     path: list[str] = []
     model: type[BaseModel] | None = root
     options: list[type[BaseModel]] = []
+    named: type[BaseModel] | None = None  # what each of a user's own names stands for, where the next part is one
     for part in location:
+        if named is not None:
+            path.append(str(part))
+            model, named = named, None
+            continue
         tagged = [option for option in options if get_args(option.model_fields["kind"].annotation)[0] == part]
         if tagged:
             model, options = tagged[0], []
@@ -130,7 +135,16 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
         if field is not None and part != location[-1]:
             model = inner[0] if len(inner) == 1 else None
             options = inner if len(inner) > 1 else []
+            named = _by_name(field)
     return path, model
+
+
+def _by_name(field: Any) -> type[BaseModel] | None:
+    """The section that each name of a user's own stands for, in a field that maps names to sections."""
+    if get_origin(field.annotation) is not dict:
+        return None
+    value = get_args(field.annotation)[1]
+    return value if isinstance(value, type) and issubclass(value, BaseModel) else None
 
 
 def _models(field: Any) -> list[type[BaseModel]]:

@@ -38,6 +38,8 @@ def read(path: Path) -> dict[str, Any]:
     """A run's config as plain data, not checked yet; relative paths in it become absolute, from its folder."""
     place = located(path)
     data = read_yaml(place)
+    if "arms" in data and "env" not in data:
+        raise ConfigError(f"{path} is a search, of many runs: space-dist tune run {path}")
     if "extends" in data and "env" not in data:
         raise ConfigError(f"{path} is a grid, of many runs: space-dist grid run {path}")
     from_its_folder(data, place.absolute().parent)

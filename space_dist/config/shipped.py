@@ -54,11 +54,13 @@ def about_shipped(file: str) -> str:
 
 
 def with_what_it_names(file: str) -> list[str]:
-    """A shipped file, and the shipped files that it names: what a grid extends, and instance sets."""
+    """A shipped file, and the shipped files that it names: what a grid or a search extends, and instance sets."""
     if not file.endswith(".yaml"):
         return [file]
     data, here = read_yaml(FOLDER / file), (FOLDER / file).parent
     extends, instances = data.get("extends", []), data.get("instances", {})
-    named = [*([extends] if isinstance(extends, str) else extends), *instances.values()]
+    settings, confirmed = data.get("set", {}), data.get("confirm", {}).get("instances", {})
+    instances = {**instances, **{key: name for key, name in settings.items() if key.startswith("instances.")}}
+    named = [*([extends] if isinstance(extends, str) else extends), *instances.values(), *confirmed.values()]
     below = [path.relative_to(FOLDER).as_posix() for path in ((here / name).resolve() for name in named)]
     return list(dict.fromkeys([file, *(one for name in below for one in with_what_it_names(name))]))

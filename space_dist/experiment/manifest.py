@@ -26,6 +26,7 @@ from space_dist import config as configs
 from space_dist.config import NAME, Mirrors, Patience, ResourcesConfig, RunConfig, Section
 from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment import scaling
+from space_dist.experiment.search import Search
 from space_dist.ledger import Ledger, owner_alive
 from space_dist.system.files import atomic_write
 
@@ -202,6 +203,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
     data = configs.read_yaml(place)
     if "env" in data and "extends" not in data:
         raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
+    _refuse_search(data, path)
     grid = configs.check(GridConfig, data, str(path))
     folder = place.absolute().parent
     bases = {base: configs.read(Path(configs.beside(base, folder))) for base in grid.extends}
@@ -224,6 +226,11 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
     if not cells:
         raise ConfigError(f"{path}: exclude leaves no cell")
     return grid, cells
+
+
+def _refuse_search(data: Mapping[str, Any], path: Path) -> None:
+    if "arms" in data:
+        raise ConfigError(f"{path} is a search: space-dist tune run {path}. A grid has no `arms`")
 
 
 def _from_folder(value: Any, folder: Path) -> Any:
@@ -262,7 +269,8 @@ class Cell:
     id: 12 hex digits of the identity of its config. label: unique in the grid. settings: value by axis of the grid.
     config: a resolved run config as plain data, its instance paths relative to the grid's folder.
     stack: equal for cells whose runs can share a process (`engine: population`); empty for runs that work alone.
-    shared_mb: about what each of its runs takes of that process's memory, in MB.
+    shared_mb: about what each of its runs takes of that process's memory, in MB. n_seeds: how many of the grid's seeds,
+    from the first, it runs with; 0: all. A search gives more of them to what promises more.
     """
 
     id: str
@@ -271,6 +279,7 @@ class Cell:
     config: Mapping[str, Any]
     stack: str = ""
     shared_mb: int = 0
+    n_seeds: int = 0
 
     @property
     def budget_steps(self) -> int:
@@ -302,7 +311,7 @@ class Manifest:
 
     axes: config keys in which cells differ. baseline: id of the cell that reports compare with. code, git: the version
     of this package that froze it. instances: file name in the grid's `instances` folder -> SHA-256 of its content.
-    scale: the share of the grid's seeds and steps that this is.
+    scale: the share of the grid's seeds and steps that this is. search: of a grid that grows, trial by trial.
     """
 
     name: str
@@ -317,10 +326,16 @@ class Manifest:
     code: str
     git: Mapping[str, str]
     scale: float = scaling.WHOLE
+    search: Search | None = None
 
     def runs(self) -> list[Run]:
         """Every run, seed by seed, so that all cells can be compared early on."""
-        return [Run(cell, seed) for seed in self.seeds for cell in self.cells]
+        return [Run(cell, seed) for place, seed in enumerate(self.seeds) for cell in self.cells
+                if not cell.n_seeds or place < cell.n_seeds]  # fmt: skip
+
+    def seeds_of(self, cell: Cell) -> tuple[int, ...]:
+        """The seeds that a cell runs with."""
+        return self.seeds[: cell.n_seeds] if cell.n_seeds else self.seeds
 
     @property
     def runs_digest(self) -> str:
@@ -351,23 +366,27 @@ class Manifest:
 
     def run(self, cell: str, seed: int) -> Run:
         """One run. Raises ConfigError if there is no such one."""
-        if seed not in self.seeds:
-            shown = ", ".join(map(str, self.seeds[:20])) + (", ..." if len(self.seeds) > 20 else "")
+        found = self.cell(cell)
+        seeds = self.seeds_of(found)
+        if seed not in seeds:
+            shown = ", ".join(map(str, seeds[:20])) + (", ..." if len(seeds) > 20 else "")
             raise ConfigError(f"{self.name} has no seed {seed}; it has {shown}")
-        return Run(self.cell(cell), seed)
+        return Run(found, seed)
 
     def to_json(self) -> bytes:
         """The content of manifest.json, with its own SHA-256; the same manifest gives the same bytes."""
         data: dict[str, Any] = {
             "format": FORMAT, "name": self.name, "axes": list(self.axes),
             "cells": [{"id": cell.id, "label": cell.label, "settings": cell.settings, "config": cell.config,
-                       **({"stack": cell.stack, "shared_mb": cell.shared_mb} if cell.stack else {})}
+                       **({"stack": cell.stack, "shared_mb": cell.shared_mb} if cell.stack else {}),
+                       **({"n_seeds": cell.n_seeds} if cell.n_seeds else {})}
                       for cell in self.cells],
             "seeds": list(self.seeds),
             "resources": self.resources.model_dump(), "retry": self.retry.model_dump(),
             "tracking": self.tracking.model_dump(),
             "baseline": self.baseline, "instances": dict(self.instances), "code": self.code, "git": dict(self.git),
             **({} if self.scale == scaling.WHOLE else {"scale": self.scale}),
+            **({} if self.search is None else {"search": self.search.to_json()}),
         }  # fmt: skip
         data["sha256"] = _sha256(data)
         return json.dumps(data, indent=1, sort_keys=True).encode() + b"\n"
@@ -383,14 +402,18 @@ class Manifest:
                 raise ValueError("checksum")
             del data["format"]
             cells = tuple(Cell(**cell) for cell in data.pop("cells"))
+            search = None if "search" not in data else Search.from_json(data.pop("search"))
             known: dict[str, type[Section]] = {"resources": RunResources, "retry": Retry, "tracking": GridTracking}
             sections: dict[str, Any] = {key: model.model_validate(data.pop(key)) for key, model in known.items()}
             manifest = cls(
-                cells=cells, axes=tuple(data.pop("axes")), seeds=tuple(data.pop("seeds")), **sections, **data
+                cells=cells, axes=tuple(data.pop("axes")), seeds=tuple(data.pop("seeds")), search=search, **sections,
+                **data,
             )  # fmt: skip
             names = (manifest.name, *manifest.instances)
             if not all(re.fullmatch(NAME, name) for name in names) or not all(_CELL_ID.fullmatch(c.id) for c in cells):
                 raise ValueError("a name that is none")
+            if search is not None and {trial.cell for trial in search.trials} - {"", *(cell.id for cell in cells)}:
+                raise ValueError("a trial of a cell that is none")
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             raise LedgerError(f"{source} is damaged, or no manifest of a grid") from None
         return manifest
@@ -436,13 +459,20 @@ class Grid:
 
         Raises LedgerError if the folder cannot be written.
         """
+        self.keep(files)
+        try:
+            atomic_write(self.manifest_file, manifest.to_json())
+        except OSError as error:
+            raise LedgerError(f"cannot write the grid's folder {self.folder}: {error.strerror}") from None
+
+    def keep(self, files: Mapping[str, bytes]) -> None:
+        """Store instance files (name -> content). Raises LedgerError if the folder cannot be written."""
         try:
             self.instances.mkdir(parents=True, exist_ok=True)
             for name, content in files.items():
                 # Named by content: what is there is the same.
                 if not (self.instances / name).exists():
                     atomic_write(self.instances / name, content)
-            atomic_write(self.manifest_file, manifest.to_json())
         except OSError as error:
             raise LedgerError(f"cannot write the grid's folder {self.folder}: {error.strerror}") from None
 
@@ -498,7 +528,9 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
-    config = configs.check(GridConfig, configs.read_yaml(configs.located(path)), str(path))
+    data = configs.read_yaml(configs.located(path))
+    _refuse_search(data, path)
+    config = configs.check(GridConfig, data, str(path))
     grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale)))
     if not grid.manifest_file.exists():
         small = "" if scale == scaling.WHOLE else f" --scale {scale:g}"

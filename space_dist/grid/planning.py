@@ -14,7 +14,16 @@ from space_dist.config import RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, about
 from space_dist.experiment import scaling
-from space_dist.experiment.manifest import CELL_ID_DIGITS, Cell, Grid, GridConfig, Manifest, label_of, load_grid
+from space_dist.experiment.manifest import (
+    CELL_ID_DIGITS,
+    Cell,
+    Grid,
+    GridConfig,
+    Manifest,
+    RunResources,
+    label_of,
+    load_grid,
+)
 from space_dist.grid.conductor import freeze
 from space_dist.instances import InstanceSet
 from space_dist.run.building import Blueprint
@@ -43,15 +52,15 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE) -> Plan:
     config, points = load_grid(path)
     name, seeds = scaling.name_of(config.name, scaling.checked(scale)), scaling.fewer(config.seed_list(), scale)
     grid = Grid(root.absolute() / name)
-    files = _InstanceFiles()
+    files = InstanceFiles()
     specs: dict[str, EnvironmentSpec] = {}  # by the section of a config: an environment is looked at once
     cells: dict[str, Cell] = {}
     steps = 0
     for point, data in points:
         label = label_of(point, config.axes())
         where = f"{path}, cell {label!r}"
-        resolved = scaling.shorter(_resolved(config, label, data, where), scale, where)
-        cell, run_steps = _cell(config, resolved, point, label, where, files, specs)
+        resolved = scaling.shorter(resolved_cell(config.name, label, data, where), scale, where)
+        cell, run_steps = frozen_cell(config.resources, resolved, point, label, where, files, specs)
         if cell.id in cells:
             raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
         cells[cell.id] = cell
@@ -69,7 +78,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE) -> Plan:
     return Plan(grid, grid.manifest(), steps, len(now - then), len(then - now))
 
 
-class _InstanceFiles:
+class InstanceFiles:
     """Instance sets of all cells: each file read once, each set stored once, named by its content."""
 
     def __init__(self) -> None:
@@ -98,26 +107,31 @@ class _InstanceFiles:
         return self._names[id(instances)]
 
 
-def _resolved(grid: GridConfig, label: str, data: dict[str, Any], where: str) -> RunConfig:
+def resolved_cell(grid: str, label: str, data: dict[str, Any], where: str) -> RunConfig:
+    """The run config of a cell of this grid, checked; `where` names it in errors. Raises ConfigError."""
     for key in ("tracking", "resources", "seed"):  # the grid's own
         data.pop(key, None)
     # The name of a run may become a file's.
-    name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid.name}_{label}")[:100]
+    name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid}_{label}")[:100]
     return configs.parse({**data, "name": name}, where)
 
 
-def _cell(
-    grid: GridConfig, config: RunConfig, point: dict[str, Any], label: str, where: str, files: _InstanceFiles,
+def frozen_cell(
+    resources: RunResources, config: RunConfig, point: dict[str, Any], label: str, where: str, files: InstanceFiles,
     specs: dict[str, EnvironmentSpec],
 ) -> tuple[Cell, int]:  # fmt: skip
-    """A cell, and the environment steps of each of its runs."""
+    """A cell, and the environment steps of each of its runs; what it reads goes into `files`.
+
+    point: its settings by axis. specs: of environments that were looked at before, by the section of a config. Raises
+    ConfigError if it cannot work.
+    """
     with about(where):
         section = config.env.model_dump_json()
-        blueprint = Blueprint.of(config, specs.get(section), can_share=grid.resources.workers == 0)
+        blueprint = Blueprint.of(config, specs.get(section), can_share=resources.workers == 0)
         config, specs[section] = blueprint.config, blueprint.spec
-        if config.engine == "population" and grid.resources.workers:
+        if config.engine == "population" and resources.workers:
             raise ConfigError(
-                f"engine: population with resources.workers: {grid.resources.workers}: runs that share a process have "
+                f"engine: population with resources.workers: {resources.workers}: runs that share a process have "
                 "no rollout actors of their own; use workers: 0, or engine: single"
             )
         train, test = files.sets(blueprint)

@@ -113,7 +113,7 @@ def read_cells(grid: Grid, manifest: Manifest) -> list[CellRuns]:
         runs[run_status.run.cell.id] += [] if run is None else [run]
     labels = _labels(manifest.cells)
     configurations = [
-        Configuration(labels[cell.id], tuple(runs[cell.id]), len(manifest.seeds) - len(runs[cell.id]))
+        Configuration(labels[cell.id], tuple(runs[cell.id]), len(manifest.seeds_of(cell)) - len(runs[cell.id]))
         for cell in manifest.cells
     ]
     return [

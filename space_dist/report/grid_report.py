@@ -123,6 +123,8 @@ def build_grid_report(
     if threshold is not None and not math.isfinite(threshold):
         raise ConfigError(f"--threshold must be a finite number, not {threshold}")
     manifest = grid.manifest()
+    if manifest.search is not None:  # whose best cell is the luckiest, on the instances that chose it: no result
+        raise ConfigError(f"{grid.folder} holds a search: space-dist tune report {grid.folder}")
     chosen = manifest.baseline if baseline is None else manifest.cell(baseline).id
     folder = grid.folder / "report" if out is None else out
     try:

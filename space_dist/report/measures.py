@@ -82,11 +82,12 @@ def _last_step(cells: Sequence[CellRuns]) -> int:
 def _values(cell: CellRuns, name: str, last: int) -> dict[int, float]:
     """One measure, by finished seed; without those that have no such number."""
     runs = [run for run in cell.configuration.finished if run.evaluated_at_end]
-    values = {run.status.seed: _value(run, name, last) for run in runs}
+    values = {run.status.seed: measure_of(run, name, last) for run in runs}
     return values if name != "worst" else {seed: value for seed, value in values.items() if not math.isnan(value)}
 
 
-def _value(run: Run, name: str, last: int) -> float:
+def measure_of(run: Run, name: str, last: int) -> float:
+    """One of MEASURES of a finished run; NaN where it has no such number. last: the step up to which areas reach."""
     if name == "early":
         return area(run.evaluation_steps, run.test["return"], last)
     if name == "final":

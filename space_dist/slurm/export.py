@@ -57,6 +57,11 @@ class Export:
                 f"signal.lead_seconds: {lead} is too short for resources.grace_seconds of {self.manifest.name}; "
                 f"it must be at least {need:g}"
             )
+        if self.manifest.search is not None:
+            raise ConfigError(
+                f"{self.manifest.name} is a search, whose runs are not known before it is over, and scripts are of "
+                "runs that are known; `space-dist tune run` can be the command of a job"
+            )
         if self.cpus < self.manifest.cpus_per_run:
             raise ConfigError(
                 f"cpus_per_task: {self.cpus} are too few: each run of {self.manifest.name} needs "
@@ -90,7 +95,7 @@ class Export:
     @property
     def n_runs(self) -> int:
         """All of the grid's."""
-        return len(self.manifest.cells) * len(self.manifest.seeds)
+        return len(self.manifest.runs())
 
     @property
     def n_tasks(self) -> int:

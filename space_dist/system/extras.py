@@ -8,10 +8,11 @@ from typing import Final, Literal
 
 from space_dist.errors import ConfigError
 
-Extra = Literal["ray", "mlflow", "bullet"]
+Extra = Literal["ray", "mlflow", "bullet", "tune"]
 
 _NAMES: Final[dict[Extra, tuple[str, str]]] = {
     "ray": ("Ray", "ray"), "mlflow": ("MLflow", "mlflow"), "bullet": ("PyBullet", "pybullet"),
+    "tune": ("Optuna", "optuna"),
 }  # fmt: skip
 
 

@@ -62,14 +62,18 @@ def describe_cell(cell: Cell, looks: Sequence[Look]) -> str:
 
 def _plan(grid: Grid, manifest: Manifest) -> list[str]:
     cells, seeds, resources = manifest.cells, manifest.seeds, manifest.resources
-    budgets = [cell.budget_steps for cell in cells]
+    budgets = [cell.budget_steps for cell in cells] or [0]  # of a search, all of whose settings may be refused
     each = f"{budgets[0]:,}" if len({*budgets}) == 1 else f"{min(budgets):,} to {max(budgets):,}"
+    runs = manifest.runs()
+    made_of = f"{_count(len(cells), 'cell')} × {_count(len(seeds), 'seed')}"
+    if manifest.search is not None:
+        made_of = f"a search, {len(manifest.search.trials):,} of {_count(manifest.search.total, 'trial')} asked"
     lines = [
-        f"**{_cell_text(manifest.name)}**: {_count(len(cells), 'cell')} × {_count(len(seeds), 'seed')} = "
-        f"{_count(len(cells) * len(seeds), 'run')} of {each} environment steps, {sum(budgets) * len(seeds):,} in all",
+        f"**{_cell_text(manifest.name)}**: {made_of} = {_count(len(runs), 'run')} of {each} environment steps, "
+        f"{sum(run.cell.budget_steps for run in runs):,} in all",
         "",
     ]
-    if manifest.axes:
+    if manifest.axes and manifest.search is None:
         lines += ["| varied | values |", "|---|---|"]
         for axis in manifest.axes:
             values = list(dict.fromkeys(_word(cell.settings[axis]) for cell in cells))
@@ -119,8 +123,9 @@ def _results(manifest: Manifest, looks: Sequence[Look]) -> list[str]:
     by_cell: dict[str, list[Look]] = {cell.id: [] for cell in manifest.cells}
     for look in looks:
         by_cell[look.run_status.run.cell.id].append(look)
+    which = "test" if manifest.search is None else "development"
     rows = [
-        "Final return on the test instances, over the seeds that are done:\n\n"
+        f"Final return on the {which} instances, over the seeds that are done:\n\n"
         "| cell | id | IQM | mean | least | greatest | seeds done | failed |\n|---|---|---:|---:|---:|---:|---:|---|"
     ]
     for cell in manifest.cells:

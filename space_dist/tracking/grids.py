@@ -205,7 +205,7 @@ class GridMirror:
                 return
             child = self._children[record.key] = Child(run_id, record.stamp, record.mlflow_status, self._parent_id)
         self.failed.pop(folder, None)
-        keys = [self._run_key(key, Run(cell, seed)) for seed in manifest.seeds]
+        keys = [self._run_key(key, Run(cell, seed)) for seed in manifest.seeds_of(cell)]
         # Their old parent is in MLflow's trash.
         strays = {one: found for one in keys if (found := self._children.get(one)) and found.parent != child.run_id}
         store.adopt([stray.run_id for stray in strays.values()], child.run_id)
@@ -267,7 +267,7 @@ class GridMirror:
 
     def _curve(self, manifest: Manifest, cell: Cell, grid_key: str) -> CellCurve:
         """A cell of which a run has begun."""
-        looks = [self._looks[Run(cell, seed).key] for seed in manifest.seeds]
+        looks = [self._looks[Run(cell, seed).key] for seed in manifest.seeds_of(cell)]
         begun = [look for look in looks if look.begun]
         ending, counts = _ending(looks)
         tags = {
@@ -323,13 +323,13 @@ class GridMirror:
         return Parent(
             self._key(manifest), manifest.name, {key: value[:MAX_TAG] for key, value in tags.items()},
             _plan_params(manifest), _final_numbers(manifest, looks), (self.grid.manifest_file,), table,
-            self._report() if counts["done"] else None,
+            self._report(manifest) if counts["done"] else None,
             key_of(repr([(look.run_status.condition, look.final) for look in looks])), ending,
             min((look.started_at for look in begun), default=frozen),
             max((look.ended_at for look in begun), default=frozen),
         )  # fmt: skip
 
-    def _report(self) -> Callable[[Path], None] | None:
+    def _report(self, manifest: Manifest) -> Callable[[Path], None] | None:
         """What writes the grid's report into a folder; None while the grid is at work and has a recent one."""
         if self.saw_life and time.monotonic() - self._reported < _REPORT_SECONDS:
             return None
@@ -340,7 +340,12 @@ class GridMirror:
             # Before it is made: one that cannot be made is not tried at every look.
             self._reported = time.monotonic()
             try:
-                report.build_grid_report(self.grid, folder, in_depth=False)  # it is made again and again
+                if manifest.search is None:
+                    report.build_grid_report(self.grid, folder, in_depth=False)  # it is made again and again
+                else:
+                    from space_dist.report.search_report import build_search_report  # here: it imports Optuna
+
+                    build_search_report(self.grid, folder)
             except SpaceDistError as error:
                 log.warning("%s: its report was not made: %s", self.grid.folder, error)
 
@@ -375,7 +380,19 @@ def _place(cell: Cell) -> str:
 
 
 def _plan_params(manifest: Manifest) -> dict[str, str]:
-    """The plan: how many cells and seeds, what is varied, and what all cells have in common."""
+    """The plan: how many cells and seeds, what is varied, and what all cells have in common.
+
+    Of a search, which has more cells with every generation: what does not change, for another plan is another run.
+    """
+    if manifest.search is not None:
+        config = manifest.search.config
+        searched = {f"search.{arm}.{key}": str({name: value for name, value in one.items() if value})
+                    for arm, record in manifest.search.arms.items() for key, one in record.space.items()}  # fmt: skip
+        return {
+            "arms": ", ".join(manifest.search.arms), "trials": str(config["trials"]), "seeds": str(len(manifest.seeds)),
+            "seed_list": ", ".join(map(str, manifest.seeds))[:_MAX_LISTED], "objective": config["objective"]["kind"],
+            "sampler": config["sampler"]["kind"], **searched,
+        }  # fmt: skip
     each = [as_params({key: value for key, value in cell.config.items() if key not in ("instances", "name")})
             for cell in manifest.cells]  # fmt: skip
     common = {key: value for key, value in each[0].items() if all(one.get(key) == value for one in each[1:])}

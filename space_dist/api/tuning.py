@@ -1,0 +1,114 @@
+"""Work through a search from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from space_dist.api.grids import GridRun, worked_through
+from space_dist.api.progress import line_of_grid, shown
+from space_dist.errors import ConfigError
+from space_dist.experiment.manifest import Grid, Manifest
+from space_dist.experiment.tuning import find_tune
+from space_dist.grid.conductor import Overview, working_on
+from space_dist.system.extras import needed_from
+from space_dist.system.importing import look_here_too
+from space_dist.system.interrupts import StopRequests
+from space_dist.system.workplace import lasting, workplace
+
+if TYPE_CHECKING:
+    from space_dist.grid.jobs import Mode
+
+Observing = Callable[[Manifest], AbstractContextManager[Callable[[Overview], None]]]
+
+
+def run_search(
+    search: Path | str,
+    *,
+    root: Path | str | None = None,
+    max_parallel: int | None = None,
+    progress: bool | Callable[[Overview], None] = True,
+) -> GridRun:
+    """Work through a search on this machine, as `space-dist tune run` does: what is done is skipped.
+
+    search: its YAML file, `shipped:NAME`, or its folder.  root: the folder that holds searches' folders; None: `runs`
+    here.  max_parallel: runs at a time; None: as many as there are CPUs for.  progress: show a line that changes in its
+    place; or what is called now and then.
+
+    `GridRun.manifest.search` of what is returned has every trial and what it reached. Trials that fail are recorded as
+    failed. Raises ConfigError for every fault of the files, LedgerError if the folder cannot be written, SpaceDistError
+    if runs failed for reasons that say nothing of their settings.
+    """
+    look_here_too()
+    base = workplace() / "runs" if root is None else lasting(Path(root), "root")
+    place = planned(Path(search), base)
+    stop = StopRequests()
+    with shown(progress is True) as show:
+
+        @contextmanager
+        def observing(manifest: Manifest) -> Iterator[Callable[[Overview], None]]:
+            def observe(overview: Overview) -> None:
+                if callable(progress):
+                    progress(overview)
+                show(line_of_grid(manifest.name, overview))
+
+            yield observe
+
+        with working_on(place, place.manifest(), wait=True, stop_requested=stop.reason, say=show):
+            searched_through(place, observing=observing, stop=stop, max_parallel=max_parallel)
+    return GridRun(place.folder)
+
+
+def planned(path: Path, root: Path) -> Grid:
+    """The search a user wants to run, planned below `root` from YAML, or as it lies in its folder."""
+    if path.is_dir():
+        return find_tune(path, root)
+    with needed_from("tune", "a search"):
+        from space_dist.grid.tuning import plan_search  # imports torch, to see whether every arm can learn
+    return plan_search(path, root).grid
+
+
+def searched_through(
+    place: Grid, *, observing: Observing, stop: StopRequests, address: str = "local", mode: Mode = "auto",
+    max_parallel: int | None = None, nodes: int = 1, reinstall: Callable[[], None] = lambda: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Manifest:  # fmt: skip
+    """Work through generation after generation of a planned search; returns its manifest in the end.
+
+    For whoever works on the grid. Arguments: as of `worked_through`. say: hears of every generation. Raises as
+    `advance`, and Interrupted if asked to stop.
+    """
+    with needed_from("tune", "a search"):
+        from space_dist.grid.tuning import advance, open_runs
+    manifest = place.manifest()  # now: whoever worked on it before us may have asked more
+    if manifest.search is None:
+        raise ConfigError(f"{place.folder} holds a grid: space-dist grid run {place.folder}")
+    while manifest.search is not None and not manifest.search.over:
+        if runs := open_runs(manifest):
+            say(in_words(manifest))
+            with observing(manifest) as observe:
+                worked_through(
+                    place, manifest, runs, stop=stop, observe=observe, address=address, mode=mode,
+                    max_parallel=max_parallel, nodes=nodes, reinstall=reinstall,
+                )  # fmt: skip
+        after = advance(place, manifest)
+        if after is None:  # somebody has let a failed run be tried again meanwhile
+            continue
+        manifest = after
+    return manifest
+
+
+def in_words(manifest: Manifest) -> str:
+    """How far a search is: `pointmass: generation 2 of 6, 10 of 60 trials over`."""
+    search = manifest.search
+    assert search is not None  # noqa: S101 - of a search
+    over = sum(trial.state != "open" for trial in search.trials)
+    generations = -(-int(search.config["trials"]) // int(search.config["generation"]))
+    open_now = search.open
+    racing = f", {len(open_now)} open with {open_now[0].seeds} seeds each" if open_now else ""
+    return (
+        f"{manifest.name}: generation {search.generation + 1} of {generations}, {over} of {search.total} trials over"
+        f"{racing}"
+    )

@@ -1,0 +1,239 @@
+"""Commands about searches: plan, run, status, report, confirm. The rest is a grid's: `space-dist grid retry FOLDER`."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+from rich.table import Table
+from rich.text import Text
+from typer.core import TyperGroup
+
+from space_dist.cli.grids import Root, log_to, mode_of, prepare, print_json, root_of, run_statuses_of
+from space_dist.cli.overview import display, print_failures, summary, workers_in_words
+from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
+from space_dist.errors import ConfigError
+from space_dist.system.extras import needed_from
+
+if TYPE_CHECKING:
+    from space_dist.experiment.manifest import Grid, Manifest
+    from space_dist.experiment.search import Search
+
+_WATCH_SECONDS = 1.0
+_FILES = (".yaml", ".yml")
+_FAILED, _UNFINISHED = 1, 3  # exit codes of `tune status`
+
+
+class _RunsFiles(TyperGroup):
+    """`space-dist tune FILE.yaml` is `space-dist tune run FILE.yaml`."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Of the words behind `tune`, the first of which names a command, or a file."""
+        if args and args[0] not in self.commands and (args[0].endswith(_FILES) or args[0].startswith("shipped:")):
+            args = ["run", *args]
+        return super().resolve_command(ctx, args)
+
+
+tune_app = typer.Typer(
+    cls=_RunsFiles, no_args_is_help=True,
+    help="Search for settings, several seeds a trial, and confirm what was found. `tune FILE.yaml` runs a search.",
+)  # fmt: skip
+
+TunePath = Annotated[
+    Path, typer.Argument(metavar="TUNE", help="A search's YAML file, or its folder.", show_default=False)
+]
+
+
+@tune_app.command("plan")
+def tune_plan(tune: TunePath, root: Root = None, as_json: Json = False) -> None:
+    """Check a search, print what it comes to, and freeze it with its first trials."""
+    with needed_from("tune", "a search"):
+        from space_dist.grid.tuning import plan_search
+
+    if tune.is_dir():
+        raise ConfigError(f"{tune} is planned already; `space-dist tune status {tune}` tells how far it is")
+    made = plan_search(tune, root_of(root))
+    manifest, search = made.manifest, _search_of(made.grid, made.manifest)
+    if as_json:
+        print_json({"folder": str(made.grid.folder), "steps": made.steps, "new": made.new} | _numbers(search))
+        return
+    seeds = len(manifest.seeds)
+    say(
+        f"{len(search.arms)} arms x {search.config['trials']} trials x {seeds} seeds = {search.total * seeds} runs, "
+        f"{made.steps:,} environment steps"
+        + (" at most: trials that are given up get fewer" if search.config["pruner"] else "")
+    )
+    for arm, record in search.arms.items():
+        say(f"{arm}: {', '.join(record.space)}")
+    _print_trials(search, [trial.cell for trial in search.trials if trial.generation == search.generation])
+    say(f"{'frozen' if made.new else 'goes on'} in {made.grid.folder}")
+
+
+@tune_app.command("run")
+def tune_run(
+    tune: TunePath,
+    root: Root = None,
+    max_parallel: Annotated[
+        Optional[int],  # noqa: UP045 - typer reads annotations at run time
+        typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
+    ] = None,
+    address: Annotated[
+        str, typer.Option(help="local: this machine; auto: the Ray cluster this process is in.")
+    ] = "local",
+    mode: Annotated[
+        str,
+        typer.Option(
+            help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length. On this "
+            "machine Ray is used with `pool`, and by `auto` where runs have rollout actors."
+        ),
+    ] = "auto",
+    nodes: Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")] = 1,
+) -> None:
+    """Work through a search, generation by generation: skip what is done, go on with what is not."""
+    chosen = mode_of(mode)
+    prepare(address)
+    from space_dist.api.tuning import planned, searched_through
+    from space_dist.grid.conductor import working_on
+
+    place = planned(tune, root_of(root))
+    log_to(place)
+    with working_on(place, place.manifest(), wait=True, stop_requested=STOP.reason, say=warn):
+        manifest = searched_through(
+            place, observing=lambda manifest: display(manifest, place), stop=STOP, address=address, mode=chosen,
+            max_parallel=max_parallel, nodes=nodes, reinstall=STOP.install, say=say,
+        )  # fmt: skip
+    search = _search_of(place, manifest)
+    _print_failed(search)
+    say(f"{_summary(manifest, search)}. {place.folder}")
+    none = [arm for arm in search.arms if search.best(arm) is None]
+    for arm in none:
+        warn(f"arm {arm} has no complete trial, and so nothing to confirm")
+    if none:
+        raise typer.Exit(_FAILED)
+    say(f"`space-dist tune confirm {place.folder}` writes the grid that tells what it is worth")
+
+
+@tune_app.command("status")
+def tune_status(
+    tune: TunePath,
+    root: Root = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on showing until nothing is left to do.")] = False,
+    as_json: Json = False,
+    by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
+) -> None:
+    """Where every trial stands. Exit codes: 0 over, 1 held up by failures, 3 unfinished."""
+    from space_dist.experiment.tuning import find_tune
+
+    place = find_tune(tune, root_of(root))
+    while True:
+        manifest = place.manifest()
+        search = _search_of(place, manifest)
+        waiting = {trial.cell for trial in search.open}
+        found = run_statuses_of(place, manifest, [run for run in manifest.runs() if run.cell.id in waiting])
+        settled = bool(found) and all(one.condition in ("done", "failed") for one in found)
+        if as_json:
+            print_json({"folder": str(place.folder), "owner_alive": place.owner_alive()} | _numbers(search))
+        else:
+            if watch and console.is_terminal:
+                console.clear()
+            _print_trials(search, [trial.cell for trial in search.trials])
+            print_failures(found, by_cause)
+            say(_summary(manifest, search))
+            if found:
+                say(f"now: {summary(manifest, found)}{workers_in_words(place, None)}")
+        held_up = settled and any(one.condition == "failed" for one in found) and not place.owner_alive()
+        if not watch or output_left() or search.over or held_up:
+            raise typer.Exit(0 if search.over else _FAILED if held_up else _UNFINISHED)
+        time.sleep(_WATCH_SECONDS)
+
+
+@tune_app.command("report")
+def tune_report(
+    tune: TunePath,
+    root: Root = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder for figures and tables. Default: report in the search's folder."),
+    ] = None,
+) -> None:
+    """The search, the importance of its settings, and apart from it what was confirmed."""
+    from space_dist.experiment.tuning import find_tune
+
+    with needed_from("tune", "the report of a search"):
+        from space_dist.report.search_report import build_search_report
+
+    place = find_tune(tune, root_of(root))
+    made = build_search_report(place, out)
+    for line in made.summary:
+        say(line)
+    say(f"{made.folder / 'report.html'}")
+
+
+@tune_app.command("confirm")
+def tune_confirm(tune: TunePath, root: Root = None) -> None:
+    """Write the grid that runs the best setting of each arm with fresh seeds on the final instances."""
+    from space_dist.experiment.tuning import find_tune
+
+    with needed_from("tune", "a search"):
+        from space_dist.grid.tuning import confirmation
+
+    place = find_tune(tune, root_of(root))
+    manifest = place.manifest()
+    written = confirmation(place, manifest)
+    search = _search_of(place, manifest)
+    for arm in search.arms:
+        best = search.best(arm)
+        say(f"{arm}: trial {best.number if best is not None else ''}")
+    say(f"`space-dist grid run {written} --root {place.folder.parent}` runs it; `space-dist tune report` shows it")
+
+
+# ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def _search_of(place: Grid, manifest: Manifest) -> Search:
+    if manifest.search is None:
+        raise ConfigError(f"{place.folder} holds a grid, and no search: space-dist grid status {place.folder}")
+    return manifest.search
+
+
+def _summary(manifest: Manifest, search: Search) -> str:
+    counts = Counter(trial.state for trial in search.trials)
+    parts = [f"{count} {state}" for state, count in sorted(counts.items())]
+    return f"{manifest.name}: {len(search.trials)} of {search.total} trials asked: {', '.join(parts)}"
+
+
+def _print_trials(search: Search, cells: list[str]) -> None:
+    """How the trials of each arm stand, and what those of these cells are; what they reached is the report's."""
+    table = Table(title_justify="left")
+    for column in ("arm", "trial", "state", "seeds", "setting"):
+        table.add_column(column, justify="right" if column in ("trial", "seeds") else "left", overflow="fold")
+    for trial in search.trials:
+        if trial.cell in cells:
+            setting = " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in trial.parameters.items())
+            table.add_row(*map(Text, (trial.arm, str(trial.number), trial.state, str(trial.seeds), setting)))
+    console.print(table)
+
+
+def _print_failed(search: Search) -> None:
+    for trial in search.trials:
+        if trial.state == "failed":
+            warn(f"trial {trial.number} of {trial.arm} failed: {trial.remark}")
+
+
+def _numbers(search: Search) -> dict[str, Any]:
+    """For programs: every trial, and what it reached."""
+    return {
+        "generation": search.generation, "trials_in_all": search.total, "over": search.over,
+        "counts": dict(Counter(trial.state for trial in search.trials)),
+        "trials": [
+            {
+                "arm": trial.arm, "trial": trial.number, "generation": trial.generation, "cell": trial.cell,
+                "state": trial.state, "seeds": trial.seeds, "parameters": dict(trial.parameters),
+                "values": {str(seeds): value for seeds, value in trial.values.items()}, "remark": trial.remark,
+            }
+            for trial in search.trials
+        ],
+    }  # fmt: skip

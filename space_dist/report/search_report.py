@@ -1,0 +1,316 @@
+"""The report of a search: what was searched and what mattered, and, apart from it, what its choices are worth.
+
+The best value of a search is the luckiest of many, measured on the instances that chose it: no result. What a tuned
+setting reaches is what its confirmation reached, with fresh seeds on instances that the search has not seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.experiment.manifest import Cell, Grid, Manifest
+from space_dist.experiment.sampling import FEWEST_WEIGHED, importance
+from space_dist.experiment.search import Search, Trial
+from space_dist.experiment.status import run_statuses
+from space_dist.experiment.tuning import confirmation_of
+from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
+from space_dist.report.figures import COLOURS, dress, empty_figure, plain, png, style_of
+from space_dist.report.grid_report import build_grid_report
+from space_dist.report.objective import IN_WORDS
+from space_dist.report.tables import NONE, Value, to_csv
+from space_dist.system.files import atomic_write
+
+MAX_LISTED: Final = 100  # failed trials; trials.csv has all
+_COLUMNS: Final = 3
+_METHOD: Final = tuple(
+    " ".join(paragraph.split())
+    for paragraph in f"""
+Every arm has the same number of trials, and every trial that is not given up the same seeds. A trial's objective is one
+number over its seeds. It chose the setting; it is not what the setting is worth: the greatest of many noisy numbers is
+too great, the more so the more trials there are and the fewer seeds.
+
+Complete: all seeds were run. Pruned: racing gave it up after some of them. Failed: a run of it crashed, used more
+memory or time than it may, or its objective is no number; the sampler is told so, and the search goes on.
+
+Importance is the share of the objective's variance over an arm's complete trials that a setting explains, alone and
+together with others (fANOVA, Hutter et al. 2014, computed by Optuna): of settings that all these trials have, from
+{FEWEST_WEIGHED} complete trials on. It says what mattered within the ranges that were searched, and nothing beyond
+them.""".split("\n\n")
+)
+
+
+@dataclass(frozen=True)
+class SearchReport:
+    """What `build_search_report` wrote into `folder`: report.md, report.html, trials.csv, and PNG figures.
+
+    `summary` are sentences: how far the search is, and whether its choices are confirmed.
+    """
+
+    folder: Path
+    summary: list[str]
+    markdown: str
+
+
+def build_search_report(grid: Grid, out: Path | None = None) -> SearchReport:
+    """Report on a search as it stands, and on its confirmation beside it; `out` is by default `report` in its folder.
+
+    Raises ConfigError if the folder holds a grid and no search, or if `out` cannot be written to; LedgerError if the
+    manifest is missing or damaged.
+    """
+    manifest = grid.manifest()
+    search = manifest.search
+    if search is None:
+        raise ConfigError(f"{grid.folder} holds a grid, and no search: space-dist report {grid.folder}")
+    folder = grid.folder / "report" if out is None else out
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    confirmed, of_confirmation = _confirmation(grid, manifest, search, folder)
+    shares = {arm: importance(search, arm) for arm in search.arms}
+    summary = [_how_far(search), of_confirmation]
+    document = Document(
+        f"Search {manifest.name}",
+        [
+            Section("", summary),
+            *confirmed,
+            _searched(grid, manifest, search),
+            *_importance(shares),
+            *_failed(search),
+            Section("How to read this", _METHOD),
+        ],
+    )
+    markdown = to_markdown(document)
+    files = {
+        **{picture.file: picture.png for section in document.sections for picture in section.pictures},
+        "trials.csv": to_csv(_trial_rows(search)).encode(),
+        "report.md": markdown.encode(),
+        "report.html": to_html(document).encode(),
+    }
+    try:
+        for name, content in files.items():
+            atomic_write(folder / name, content)
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    return SearchReport(folder, summary, markdown)
+
+
+def _unwritable(folder: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}")
+
+
+# ---- the search ------------------------------------------------------------------------------------------------------
+
+
+def _how_far(search: Search) -> str:
+    counts = Counter(trial.state for trial in search.trials)
+    known = ", ".join(f"{counts[state]} {state}" for state in ("complete", "pruned", "failed", "open") if counts[state])
+    if search.over:
+        return f"The search is over: of {search.total} trials, {known}."
+    return f"The search is not over: {len(search.trials)} of {search.total} trials were asked: {known}."
+
+
+def _searched(grid: Grid, manifest: Manifest, search: Search) -> Section:
+    rows = _arms(grid, manifest, search)
+    return Section("Search", [_about_search(search)], rows, pictures=_course(search), words=True)
+
+
+def _about_search(search: Search) -> str:
+    objective = search.config["objective"]
+    level = "" if objective["threshold"] is None else f" of {objective['threshold']:g}"
+    better = "more" if search.maximizes else "less"
+    return (
+        f"Trials were judged by the {IN_WORDS[objective['kind']]}{level}, one number over seeds, {better} is better. "
+        "The settings below were chosen by it; none of its values is a result."
+    )
+
+
+def _arms(grid: Grid, manifest: Manifest, search: Search) -> list[dict[str, str]]:
+    steps: Counter[str] = Counter()
+    for one in run_statuses(grid, manifest, manifest.code):
+        steps[one.run.cell.id] += one.steps
+    rows = []
+    for arm in search.arms:
+        trials, best = search.of_arm(arm), search.best(arm)
+        counts = Counter(trial.state for trial in trials)
+        rows.append(
+            {
+                "arm": arm,
+                "trials": f"{len(trials)}/{search.config['trials']}",
+                **{state: str(counts[state]) for state in ("complete", "pruned", "failed")},
+                "environment steps": f"{sum(steps[cell] for cell in {trial.cell for trial in trials}):,}",
+                "chosen": NONE if best is None else f"trial {best.number}",
+                "setting": NONE if best is None else _setting(best),
+            }
+        )
+    return rows
+
+
+def _setting(trial: Trial) -> str:
+    return ", ".join(f"{key}: {_word(value)}" for key, value in trial.parameters.items())
+
+
+def _word(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _course(search: Search) -> list[Picture]:
+    if not any(trial.values for trial in search.trials):
+        return []
+    caption = "Objective of each trial, in the order in which they were asked: what the search saw, and no result"
+    return [Picture("trials.png", caption, png(draw_trials(search)))]
+
+
+def draw_trials(search: Search) -> Figure:
+    """The objective of every trial over its number, a colour an arm; hollow: given up, with its last rung's value."""
+    figure = empty_figure(8.0, 4.4)
+    axes = figure.subplots()
+    for number, arm in enumerate(search.arms):
+        colour = COLOURS[number % len(COLOURS)]
+        for state, filled in (("complete", colour), ("pruned", "none")):
+            found = [trial for trial in search.of_arm(arm) if trial.state == state]
+            values = [trial.values[max(trial.values)] for trial in found]
+            label = plain(arm if state == "complete" else f"{arm}, given up")
+            if found:
+                axes.scatter([trial.number for trial in found], values, s=26, facecolor=filled, edgecolor=colour,
+                             marker="os^Dv"[number % 5], label=label)  # fmt: skip
+    axes.set_xlabel("trial")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylabel(f"objective: {search.config['objective']['kind']}, over seeds")
+    dress(axes, "What the search saw, on the development instances")
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _importance(shares: Mapping[str, Mapping[str, float]]) -> list[Section]:
+    told = {arm: found for arm, found in shares.items() if found}
+    if not told:
+        return []
+    keys = list(dict.fromkeys(key for found in told.values() for key in found))
+    rows = [
+        {"setting": key, **{arm: f"{found[key]:.2f}" if key in found else NONE for arm, found in told.items()}}
+        for key in keys
+    ]
+    picture = Picture(
+        "importance.png", "Share of the objective's variance that each setting explains", png(draw_importance(told))
+    )
+    return [Section("Importance of settings", rows=rows, pictures=[picture])]
+
+
+def draw_importance(shares: Mapping[str, Mapping[str, float]]) -> Figure:
+    """A diagram an arm: a bar for each searched key, the most important one on top."""
+    columns = min(_COLUMNS, len(shares))
+    rows = -(-len(shares) // columns)
+    longest = max(len(found) for found in shares.values())
+    figure = empty_figure(5.2 * columns, rows * (1.4 + 0.3 * longest))
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for place, (axes, (arm, found)) in enumerate(zip(grid.flat, shares.items(), strict=False)):
+        names = [plain(key) for key in found]
+        axes.barh(names[::-1], [*found.values()][::-1], color=style_of(place)["color"])
+        axes.set_xlim(0.0, 1.0)
+        axes.set_xlabel("share of the variance")
+        dress(axes, plain(arm))
+    for axes in grid.flat[len(shares) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _failed(search: Search) -> list[Section]:
+    found = [trial for trial in search.trials if trial.state == "failed"]
+    if not found:
+        return []
+    rows = [{"trial": f"{trial.arm} {trial.number}", "why": trial.remark, "setting": _setting(trial)}
+            for trial in found[:MAX_LISTED]]  # fmt: skip
+    text = [f"The first {MAX_LISTED} of {len(found)}; trials.csv has all."] if len(found) > MAX_LISTED else []
+    return [Section("Failed trials", text, rows, words=True)]
+
+
+def _trial_rows(search: Search) -> list[dict[str, Value]]:
+    """Every trial, and what the search saw of it."""
+    keys = list(dict.fromkeys(key for arm in search.arms.values() for key in arm.space))
+    return [
+        {
+            "arm": trial.arm, "trial": trial.number, "generation": trial.generation, "state": trial.state,
+            "cell": trial.cell, "seeds": max(trial.values, default=0),
+            "search_objective": trial.values[max(trial.values)] if trial.values else math.nan,
+            **{key: None if key not in trial.parameters else _plain(trial.parameters[key]) for key in keys},
+            "remark": trial.remark,
+        }
+        for trial in search.trials
+    ]  # fmt: skip
+
+
+def _plain(value: Any) -> Value:
+    return value if isinstance(value, int | float | str) else str(value)
+
+
+# ---- the confirmation ------------------------------------------------------------------------------------------------
+
+
+def _confirmation(grid: Grid, manifest: Manifest, search: Search, out: Path) -> tuple[list[Section], str]:
+    """What the confirming grid beside the search's reached, and a sentence on it; nothing where it is not of this one.
+
+    Its own report is written below `out`.
+    """
+    confirming = Grid(grid.folder.parent / confirmation_of(manifest.name))
+    none = "Its choices are not confirmed yet, so there is no number to report"
+    if not confirming.manifest_file.exists():
+        return [], f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it."
+    try:
+        found = confirming.manifest()
+    except LedgerError as error:
+        return [], f"{none}: {error}."
+    if fault := _not_of_this(found, manifest, search):
+        return [], f"{none}: {confirming.folder} {fault}; `space-dist tune confirm {grid.folder}` writes it anew."
+    made = build_grid_report(confirming, out / "confirmation", in_depth=False)
+    curves = made.folder / "curves.png"
+    pictures = [
+        Picture("confirmation.png", "Learning curves of the confirmation", curves.read_bytes())
+    ] if curves.exists() else []  # fmt: skip
+    seeds = len(found.seeds)
+    text = [
+        f"The chosen setting of each arm, {seeds} fresh seed{'s' if seeds > 1 else ''}, on the final instances, which "
+        "the search has not seen.",
+        *made.summary,
+    ]
+    done = made.summary[0]
+    return [Section("Confirmation", text, made.table, made.remarks, pictures)], f"Confirmation: {done}"
+
+
+def _not_of_this(found: Manifest, manifest: Manifest, search: Search) -> str:
+    """Why a grid confirms nothing of this search; empty if it does."""
+    if {*found.seeds} & {*manifest.seeds}:
+        return "has seeds of the search"
+    cells = {Path(str(cell.settings.get("extends", ""))).stem: cell for cell in found.cells}
+    if len(search.arms) == 1 and len(found.cells) == 1:
+        cells = {next(iter(search.arms)): found.cells[0]}
+    if cells.keys() != search.arms.keys():
+        return "has other arms than the search"
+    for arm, cell in cells.items():
+        best = search.best(arm)
+        if best is None or any(not _same(cell, key, value) for key, value in best.parameters.items()):
+            return f"has another setting of {arm} than the search has chosen"
+        if dict(cell.config["instances"]) != dict(search.final):
+            return "has other instances than confirm.instances names"
+    return ""
+
+
+def _same(cell: Cell, key: str, value: Any) -> bool:
+    found: Any = cell.config
+    for part in key.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    if isinstance(value, Mapping):  # a whole section: defaults were added to it
+        return isinstance(found, Mapping) and all(found.get(name) == one for name, one in value.items())
+    if isinstance(value, float) and isinstance(found, int | float):
+        return bool(np.isclose(found, value, rtol=1e-12, atol=0.0))
+    return bool(found == value)
