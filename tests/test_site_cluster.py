@@ -27,7 +27,7 @@ sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.servers import TrackingServer, free_ports
 
-pytestmark = [pytest.mark.ray, pytest.mark.server]
+pytestmark = [pytest.mark.ray, pytest.mark.server, pytest.mark.timeout(900)]  # `status --watch` waits for ever
 MARK = "SPACE_DIST_PAGES"  # in the environment of all that is started here
 STARTED = """ray() {
   if [ "$1" = start ]; then
