@@ -254,7 +254,6 @@ def test_cheap_commands_work_as_they_are_written(tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     small = [word for one in SMALL for word in ("--set", one)]
-    assert command(monkeypatch, "train", "configs/pointmass_round_robin.yaml", *small) == 0  # which is reported on
     done = []
     for place, line in enumerate(dict.fromkeys(line.words for line in COMMANDS if executed(line))):
         words = [f"{tmp_path}/{place}{word}" if word.startswith("/shared") else word for word in line[1:]]
