@@ -1,4 +1,4 @@
-"""Searches: the file, the draws, what becomes of trials, racing, the confirmation, and what the report says."""
+"""Searches: the file, the draws, what becomes of trials, and racing. What follows: tests/test_tuning_reports.py."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import dataclasses
 import json
 import math
 import random
-import re
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -19,30 +17,21 @@ import pytest
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause
-from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, load_grid
-from space_dist.experiment.sampling import draw, given_up, importance
-from space_dist.experiment.search import Search, Trial
+from space_dist.experiment.manifest import Manifest, Run, load_grid
+from space_dist.experiment.sampling import given_up
 from space_dist.experiment.status import Attempts
 from space_dist.experiment.tuning import Distribution, Objective, Pruner, TuneConfig, find_tune, load_tune
 from space_dist.grid.planning import plan
 from space_dist.grid.tuning import HeldUpError, advance, confirmation, open_runs, plan_search
-from space_dist.report import build_grid_report, load_run
+from space_dist.report import load_run
 from space_dist.report.objective import over_seeds
 from space_dist.report.search_report import build_search_report
-from space_dist.tracking import sync
-from tests.commanding import command
 from tests.grids import SMALL, write_grid
-from tests.test_grid_tracking import levels
 from tests.test_report import continue_run, start_run
-from tests.tunes import ARMS, RATE, ROOT, end, reached, search_through, write_tune
+from tests.tunes import ARMS, RATE, ROOT, end, reached, search_of, search_through, write_tune
 
 GOAL = str(ROOT / "configs/instances/pointmass_goal_test.csv")
 UNIFORM = str(ROOT / "configs/instances/pointmass_uniform_test.csv")
-
-
-def search_of(manifest: Manifest) -> Search:
-    assert manifest.search is not None
-    return manifest.search
 
 
 def choices(manifest: Manifest) -> list[tuple[str, int, dict[str, Any]]]:
@@ -509,198 +498,3 @@ def test_objectives_are_the_reports_statistics(tmp_path: Path) -> None:
     unfinished = start_run(tmp_path / "more", seed=7)
     continue_run(unfinished, [0.0, 1.0], [[0]], state="failed")
     assert math.isnan(over_seeds([*runs, load_run(unfinished)], Objective(), 4000))
-
-
-# ---- the confirmation and the report --------------------------------------------------------------------------------
-
-
-def test_the_confirmation_is_a_grid_of_the_best_with_fresh_seeds_on_final_instances(tmp_path: Path) -> None:
-    path = write_tune(tmp_path, confirm={"seeds": {"start": 100, "count": 3}, "instances": {"test": UNIFORM},
-                                         "set": {"budget.steps": 4096}})  # fmt: skip
-    root = tmp_path / "runs"
-    grid, manifest = search_through(path, root, generations=1)
-    with pytest.raises(ConfigError, match="is not over"):
-        confirmation(grid, manifest)
-    grid, manifest = search_through(path, root)
-    written = confirmation(grid, manifest)
-    config, _ = load_grid(written)
-    assert isinstance(config, GridConfig)
-    made = plan(written, root)
-    assert made.manifest.seeds == (100, 101, 102)
-    assert made.grid.folder == root / "search-confirm"
-    for cell in made.manifest.cells:
-        best = search_of(manifest).best(cell.label)
-        assert best is not None
-        run = made.grid.run_config(made.manifest, Run(cell, 100))
-        assert run.learner.learning_rate == best.parameters["learner.learning_rate"]
-        assert run.budget.steps == 4096
-        assert run.curriculum.kind == cell.label
-        assert run.instances.test.read_text().splitlines()[1:] == sorted(
-            Path(UNIFORM).read_text().splitlines()[1:], key=lambda line: int(line.split(",")[0])
-        )
-
-
-def test_the_report_keeps_search_and_confirmation_apart(tmp_path: Path) -> None:
-    path, root = write_tune(tmp_path, trials=20, generation=10, seeds=[0]), tmp_path / "runs"
-    grid, manifest = search_through(path, root)
-    search = search_of(manifest)
-    with pytest.raises(ConfigError, match="space-dist tune report"):
-        build_grid_report(grid)
-    report = build_search_report(grid)
-    assert "not confirmed yet, so there is no number to report" in report.summary[1]
-    assert "## Confirmation" not in report.markdown
-    assert "## Importance of settings" in report.markdown
-    for name in search.arms:
-        best = search.best(name)
-        assert best is not None
-        assert best.value is not None
-        assert f"trial {best.number}" in report.markdown
-        assert f"{best.value:.2f}" not in report.markdown  # which is the luckiest, and no result
-    confirming = plan(confirmation(grid, manifest), root)
-    for run in confirming.manifest.runs():
-        end(confirming.grid, run, 40.0 + run.seed)
-    report = build_search_report(grid)
-    assert "## Confirmation" in report.markdown
-    assert "141" in report.markdown.partition("## Search")[0]  # the mean of 140, 141 and 142
-    assert {path.name for path in report.folder.glob("*.png")} >= {"trials.png", "importance.png", "confirmation.png"}
-    rows = (report.folder / "trials.csv").read_text().splitlines()
-    assert len(rows) == 41
-    again = build_search_report(grid, tmp_path / "again")
-    assert again.markdown == report.markdown
-    for name in ("importance.png", "trials.csv"):
-        assert (again.folder / name).read_bytes() == (report.folder / name).read_bytes()
-
-
-def test_a_confirmation_of_something_else_is_none(tmp_path: Path) -> None:
-    path, root = write_tune(tmp_path), tmp_path / "runs"
-    grid, manifest = search_through(path, root)
-    written = confirmation(grid, manifest)
-    text = (written.parent / "space.yaml").read_text()
-    (written.parent / "space.yaml").write_text(re.sub(r"learning_rate: \S+", "learning_rate: 0.5", text))
-    plan(written, root)
-    assert "has another setting of space" in build_search_report(grid).summary[1]
-    confirmation(grid, manifest)
-    grids = written.read_text()
-    written.write_text(grids.replace("[100, 101, 102]", "[100, 1]"))
-    plan(written, root)
-    assert "has seeds of the search" in build_search_report(grid).summary[1]
-
-
-def test_importance_finds_what_decides(tmp_path: Path) -> None:
-    _, manifest = search_through(
-        write_tune(tmp_path, trials=20, generation=20, seeds=[0], search={
-            "learner.learning_rate": RATE, "learner.gae_lambda": {"float": [0.8, 0.99]}
-        }), tmp_path / "runs",
-    )  # fmt: skip
-    shares = importance(search_of(manifest), "round_robin")
-    assert next(iter(shares)) == "learner.learning_rate"
-    assert shares["learner.learning_rate"] > 0.8
-    assert sum(shares.values()) == pytest.approx(1.0)
-    assert shares == importance(search_of(manifest), "round_robin")
-    few = search_of(manifest).with_trials(search_of(manifest).trials[:19])
-    assert importance(few, "round_robin") == {}
-
-
-def test_drawing_reads_the_record_alone(tmp_path: Path) -> None:
-    """A study is rebuilt from the manifest's bytes: nothing of the one that drew before is needed."""
-    _, manifest = search_through(write_tune(tmp_path), tmp_path / "runs", generations=2)
-    search = search_of(manifest)
-    before = search.with_trials([trial for trial in search.trials if trial.generation < 2])
-    reread = Search.from_json(json.loads(json.dumps(before.to_json())))
-    asked = [dict(trial.parameters) for trial in search.of_arm("space") if trial.generation == 2]
-    assert draw(reread, "space", 2) == asked
-    assert isinstance(reread.trials[0], Trial)
-
-
-def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(
-    uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reported: list[Path] = []
-
-    def build(grid: Grid, out: Path) -> None:  # drawing takes seconds
-        reported.append(grid.folder)
-        (out / "report.html").write_text("a report")
-
-    monkeypatch.setattr("space_dist.report.search_report.build_search_report", build)
-    path, root = write_tune(tmp_path, seeds=[0], tracking={"uri": uri, "experiment": "demo"}), tmp_path / "runs"
-    ids = set()
-    for generations in (1, 2):
-        grid, manifest = search_through(path, root, generations=generations)
-        sync([], grids=[grid])
-        parent, trials, runs = levels(uri)
-        ids.add(parent.info.run_id)
-        begun = [trial for trial in search_of(manifest).trials if trial.state != "open"]
-        assert {*trials} == {f"{trial.arm} {trial.number}" for trial in begun}
-        assert len(runs) == len(begun)
-    assert len(ids) == 1  # though the plan has grown
-    assert reported == [grid.folder] * 2
-    assert parent.data.params["arms"] == "round_robin, space"
-    assert trials["space 3"].data.tags["setting.learner.learning_rate"]
-
-
-# ---- the command ----------------------------------------------------------------------------------------------------
-
-
-def test_commands_tell_how_a_search_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, root = write_tune(tmp_path), tmp_path / "runs"
-
-    def said(*words: object, code: int = 0) -> str:
-        assert command(monkeypatch, "tune", *words, "--root", root) == code
-        return capsys.readouterr().out
-
-    assert "tune plan" in _refused(monkeypatch, capsys, "status", path, root)
-    planned = json.loads(said("plan", path, "--json"))
-    assert (planned["new"], planned["trials_in_all"], len(planned["trials"])) == (True, 12, 4)
-    assert "goes on in" in said("plan", path)
-    assert "4 of 12 trials asked: 4 open" in said("status", path, code=3)
-    for run in open_runs(Grid(root / "search").manifest()):
-        end(Grid(root / "search"), run, Cause.NODE_LOST if run.seed == 2 else reached(run))
-    said("status", path, code=3)  # it will be tried again
-    search_through(path, tmp_path / "done")
-    root = tmp_path / "done"
-    found = json.loads(said("status", path, "--json"))
-    assert (found["over"], found["counts"]) == (True, {"complete": 12})
-    assert "report.html" in said("report", root / "search")
-    assert "grid run" in said("confirm", path)
-    assert "12 complete" in said("run", path)  # nothing is left to do
-    assert "12 complete" in said(path)  # the same, in short
-    assert command(monkeypatch, "grid", "run", root / "search") == 2
-    assert "holds a search: space-dist tune run" in capsys.readouterr().err
-    assert command(monkeypatch, "slurm", "export", root / "search", "--out", tmp_path / "out") == 2
-    assert "is a search" in capsys.readouterr().err
-
-
-def test_a_missing_optuna_is_named_with_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for module in ("space_dist.grid.tuning", "space_dist.experiment.sampling"):
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    assert command(monkeypatch, "tune", "plan", write_tune(tmp_path)) == 2
-    assert "a search needs Optuna: pip install 'space-dist[tune]'" in capsys.readouterr().err
-
-
-def test_a_search_without_a_cell_can_be_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Every setting of the generation was refused."""
-    made = plan_search(write_tune(tmp_path), tmp_path)
-    search = search_of(made.manifest)
-    refused = [dataclasses.replace(trial, cell="", state="failed") for trial in search.trials]
-    manifest = dataclasses.replace(made.manifest, cells=(), baseline="", search=search.with_trials(refused))
-    made.grid.freeze(manifest, {})
-    assert command(monkeypatch, "grid", "status", made.grid.folder) == 0
-    assert "has no cells yet" in capsys.readouterr().out
-    assert "Failed trials" in build_search_report(made.grid).markdown
-    after = advance(made.grid, manifest)
-    assert after is not None
-    assert len(search_of(after).open) == 4
-
-
-def _refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], what: str, path: Path, root: Path
-) -> str:
-    assert command(monkeypatch, "tune", what, path, "--root", root) == 1
-    return capsys.readouterr().err

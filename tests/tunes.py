@@ -11,6 +11,7 @@ import numpy as np
 from space_dist import config as configs
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.experiment.search import Search
 from space_dist.experiment.status import Attempts
 from space_dist.grid.tuning import advance, open_runs, plan_search
 from tests.grids import ROOT, SMALL
@@ -80,3 +81,8 @@ def search_through(
         assert after is not None
         manifest = after
     return grid, manifest
+
+
+def search_of(manifest: Manifest) -> Search:
+    assert manifest.search is not None
+    return manifest.search

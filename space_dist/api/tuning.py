@@ -102,8 +102,7 @@ def searched_through(
 
 def in_words(manifest: Manifest) -> str:
     """How far a search is: `pointmass: generation 2 of 6, 10 of 60 trials over`."""
-    search = manifest.search
-    assert search is not None  # noqa: S101 - of a search
+    search = manifest.searched
     over = sum(trial.state != "open" for trial in search.trials)
     generations = -(-int(search.config["trials"]) // int(search.config["generation"]))
     open_now = search.open

@@ -39,6 +39,19 @@ Scale = Annotated[
     float,
     typer.Option(help="Of a YAML file: this share of its seeds and steps, in a folder of its own, NAME-scale-SCALE."),
 ]
+MaxParallel = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
+]
+Address = Annotated[str, typer.Option(help="local: this machine; auto: the Ray cluster this process is in.")]
+ClusterMode = Annotated[
+    str,
+    typer.Option(
+        help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length. On this "
+        "machine Ray is used with `pool`, and by `auto` where runs have rollout actors."
+    ),
+]
+Nodes = Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")]
 JobServer = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(help="The cluster's job server, where its storage is not seen from here."),
@@ -90,25 +103,14 @@ def grid_run(
     grid: GridPath,
     root: Root = None,
     scale: Scale = 1.0,
-    max_parallel: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
-    ] = None,
-    address: Annotated[
-        str, typer.Option(help="local: this machine; auto: the Ray cluster this process is in.")
-    ] = "local",
-    mode: Annotated[
-        str,
-        typer.Option(
-            help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length. On this "
-            "machine Ray is used with `pool`, and by `auto` where runs have rollout actors."
-        ),
-    ] = "auto",
+    max_parallel: MaxParallel = None,
+    address: Address = "local",
+    mode: ClusterMode = "auto",
     part: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(help="Only runs FIRST-LAST of the manifest, counted from 0: the part of a batch system's task."),
     ] = None,
-    nodes: Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")] = 1,
+    nodes: Nodes = 1,
     stop_file: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="Stop, as on a signal, once this file exists: how a batch system's script passes one on."),

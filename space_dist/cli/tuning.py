@@ -12,7 +12,19 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from space_dist.cli.grids import Root, log_to, mode_of, prepare, print_json, root_of, run_statuses_of
+from space_dist.cli.grids import (
+    Address,
+    ClusterMode,
+    MaxParallel,
+    Nodes,
+    Root,
+    log_to,
+    mode_of,
+    prepare,
+    print_json,
+    root_of,
+    run_statuses_of,
+)
 from space_dist.cli.overview import display, print_failures, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
 from space_dist.errors import ConfigError
@@ -76,21 +88,10 @@ def tune_plan(tune: TunePath, root: Root = None, as_json: Json = False) -> None:
 def tune_run(
     tune: TunePath,
     root: Root = None,
-    max_parallel: Annotated[
-        Optional[int],  # noqa: UP045 - typer reads annotations at run time
-        typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
-    ] = None,
-    address: Annotated[
-        str, typer.Option(help="local: this machine; auto: the Ray cluster this process is in.")
-    ] = "local",
-    mode: Annotated[
-        str,
-        typer.Option(
-            help="In a cluster: pool (workers that stay warm), jobs (a Ray job a run), auto: by length. On this "
-            "machine Ray is used with `pool`, and by `auto` where runs have rollout actors."
-        ),
-    ] = "auto",
-    nodes: Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")] = 1,
+    max_parallel: MaxParallel = None,
+    address: Address = "local",
+    mode: ClusterMode = "auto",
+    nodes: Nodes = 1,
 ) -> None:
     """Work through a search, generation by generation: skip what is done, go on with what is not."""
     chosen = mode_of(mode)

@@ -343,6 +343,13 @@ class Manifest:
         return _sha256({"runs": [run.key for run in self.runs()]})[:16]
 
     @property
+    def searched(self) -> Search:
+        """The search whose trials the cells are. Raises LedgerError if there is none, for the manifest is a grid's."""
+        if self.search is None:
+            raise LedgerError(f"{self.name} is a grid, and no search")
+        return self.search
+
+    @property
     def experiment(self) -> str:
         """The MLflow experiment."""
         return self.tracking.experiment or self.name

@@ -97,8 +97,7 @@ def _begun(grid: Grid) -> Manifest | None:
 
 def _continued(grid: Grid, begun: Manifest, planned: Search) -> Manifest:
     """A search that is there already, with what of its file may change. Raises ConfigError for what may not."""
-    search = begun.search
-    assert search is not None  # noqa: S101 - `_begun` has looked
+    search = begun.searched
     before, now = (json.loads(json.dumps(one.to_json() | {"trials": [], "optuna": ""})) for one in (search, planned))
     changes = configs.changes(before["config"], now["config"])
     forbidden = [key for key in changes if key.partition(".")[0] not in _MAY_CHANGE]
@@ -264,8 +263,7 @@ def _with(base: Mapping[str, Any], setting: Mapping[str, Any]) -> dict[str, Any]
 
 def _asked(manifest: Manifest, grid: Grid) -> Manifest:
     """The manifest with the next generation of every arm. Settings that no config can have are failed trials."""
-    search = manifest.search
-    assert search is not None  # noqa: S101 - of a search
+    search = manifest.searched
     config = TuneConfig.model_validate(search.config)
     rungs = config.pruner.rungs if config.pruner is not None else ()
     first = rungs[0] if rungs else len(manifest.seeds)
@@ -329,9 +327,7 @@ def advance(grid: Grid, manifest: Manifest) -> Manifest | None:
     ConfigError for another Optuna than the one that the search began with, LedgerError if the folder cannot be read or
     written.
     """
-    search = manifest.search
-    if search is None:
-        raise LedgerError(f"{grid.manifest_file} is a grid's, and no search's")
+    search = manifest.searched
     if search.over:
         return manifest
     found = run_statuses(grid, manifest, manifest.code, open_runs(manifest))

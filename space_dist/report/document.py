@@ -9,10 +9,23 @@ from __future__ import annotations
 import base64
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
+from space_dist.errors import ConfigError
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Raises ConfigError where a report's folder, or a file in it, cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}") from None
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from space_dist.report.curricula import (
     curriculum_sections,
     inclusion_rows,
 )
-from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
+from space_dist.report.document import Document, Picture, Section, to_html, to_markdown, writing_to
 from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, draw_heat_map, draw_panels, png
 from space_dist.report.grid import (
     CellRuns,
@@ -127,10 +127,8 @@ def build_grid_report(
         raise ConfigError(f"{grid.folder} holds a search: space-dist tune report {grid.folder}")
     chosen = manifest.baseline if baseline is None else manifest.cell(baseline).id
     folder = grid.folder / "report" if out is None else out
-    try:
+    with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)  # before the work, which takes a while for a large grid
-    except OSError as error:
-        raise _unwritable(folder, error) from None
     cells = read_cells(grid, manifest)
     reference = next((cell for cell in cells if cell.cell.id == chosen), None)
     if reference is None:
@@ -184,11 +182,9 @@ def build_grid_report(
         "report.md": markdown.encode(),
         "report.html": to_html(document).encode(),
     }
-    try:
+    with writing_to(folder):
         for name, content in files.items():
             atomic_write(folder / name, content)
-    except OSError as error:
-        raise _unwritable(folder, error) from None
     table = [
         _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
     ]
@@ -198,10 +194,6 @@ def build_grid_report(
 def _more_csv(tables: Mapping[str, list[dict[str, Value]]]) -> dict[str, bytes]:
     """Those that have rows."""
     return {name: to_csv(rows).encode() for name, rows in tables.items() if rows}
-
-
-def _unwritable(folder: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}")
 
 
 # ---- sentences ------------------------------------------------------------------------------------------------------

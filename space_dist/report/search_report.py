@@ -23,7 +23,7 @@ from space_dist.experiment.sampling import FEWEST_WEIGHED, importance
 from space_dist.experiment.search import Search, Trial
 from space_dist.experiment.status import run_statuses
 from space_dist.experiment.tuning import confirmation_of
-from space_dist.report.document import Document, Picture, Section, to_html, to_markdown
+from space_dist.report.document import Document, Picture, Section, to_html, to_markdown, writing_to
 from space_dist.report.figures import COLOURS, dress, empty_figure, plain, png, style_of
 from space_dist.report.grid_report import build_grid_report
 from space_dist.report.objective import IN_WORDS
@@ -72,10 +72,8 @@ def build_search_report(grid: Grid, out: Path | None = None) -> SearchReport:
     if search is None:
         raise ConfigError(f"{grid.folder} holds a grid, and no search: space-dist report {grid.folder}")
     folder = grid.folder / "report" if out is None else out
-    try:
+    with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(folder, error) from None
     confirmed, of_confirmation = _confirmation(grid, manifest, search, folder)
     shares = {arm: importance(search, arm) for arm in search.arms}
     summary = [_how_far(search), of_confirmation]
@@ -97,16 +95,10 @@ def build_search_report(grid: Grid, out: Path | None = None) -> SearchReport:
         "report.md": markdown.encode(),
         "report.html": to_html(document).encode(),
     }
-    try:
+    with writing_to(folder):
         for name, content in files.items():
             atomic_write(folder / name, content)
-    except OSError as error:
-        raise _unwritable(folder, error) from None
     return SearchReport(folder, summary, markdown)
-
-
-def _unwritable(folder: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"the report cannot be written to {folder}: {error.strerror or error}")
 
 
 # ---- the search ------------------------------------------------------------------------------------------------------
