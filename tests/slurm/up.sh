@@ -2,14 +2,19 @@
 # up.sh DIR -- a private, real Slurm on this machine: munged, slurmctld and two slurmd, without systemd, as root.
 # Each node is a set of namespaces (pid, net, uts, ipc, mount): its own host name (n1, n2), address, /dev/shm, and
 # /var/tmp, which is DIR/tmp.n1 and DIR/tmp.n2 from outside. Killing the pid in DIR/run/n1.host.pid is a node's crash;
-# `up.sh DIR node 1` starts it again. Names and addresses on the host come from DIR, so that several can live at once.
+# `up.sh DIR node 1` starts it again. Names and addresses on the host come from DIR and from what is free, so that
+# several can live at once, and what a killed one has left is in nobody's way.
 set -euo pipefail
+trap 'echo "up.sh: line $LINENO: $BASH_COMMAND: exit code $?" >&2' ERR
 D=$(realpath -m "$1")
 PATH=$PATH:/usr/sbin:/sbin
 NODES=2 CPUS=2 MEM=8000
-N=$(($(printf %s "$D" | cksum | cut -d' ' -f1) % 200 + 20))
-NET=10.$((64 + N % 64)).$N BR=spslurm$N PORT=$((6820 + N * 4))
 export SLURM_CONF=$D/slurm.conf
+
+# number N -- the one of 200 that names and addresses on the host are made of
+number() {
+  N=$1 NET=10.$((64 + $1 % 64)).$1 BR=spslurm$1 PORT=$((6820 + $1 * 4))
+}
 
 start_node() {
   local i=$1 p
@@ -30,20 +35,26 @@ start_node() {
 }
 
 if [ "${2:-}" = node ]; then
+  number "$(sed s/spslurm// "$D/run/bridge")"
   start_node "$3"
   exit
 fi
 
 mkdir -p "$D"/{state,log,run}
 chmod 755 "$D" "$D/run"
+first=$(printf %s "$D" | cksum | cut -d' ' -f1)
+for i in $(seq 0 199); do # the bridge is what makes a number ours: another Slurm of the host's may have the first
+  number $(((first + i) % 200 + 20))
+  ip link add "$BR" type bridge 2>"$D/log/bridge" && break
+  if [ "$i" = 199 ]; then cat "$D/log/bridge" >&2; exit 1; fi
+done
+echo "$BR" >"$D/run/bridge"
 (umask 077 && head -c 1024 /dev/urandom >"$D/munge.key")
 {
   echo "127.0.0.1 localhost"
   echo "$NET.1 $(hostname -s)"
   for i in $(seq "$NODES"); do echo "$NET.$((10 + i)) n$i"; done
 } >"$D/hosts"
-ip link add "$BR" type bridge
-echo "$BR" >"$D/run/bridge"
 ip addr add "$NET.1/24" dev "$BR"
 ip link set "$BR" up
 cat >"$SLURM_CONF" <<CONF
