@@ -52,6 +52,14 @@ ClusterMode = Annotated[
     ),
 ]
 Nodes = Annotated[int, typer.Option(min=1, max=10_000, help="In a cluster: wait until it has so many nodes.")]
+Part = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(help="Only runs FIRST-LAST of the manifest, counted from 0: the part of a batch system's task."),
+]
+StopFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(help="Stop, as on a signal, once this file exists: how a batch system's script passes one on."),
+]
 JobServer = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(help="The cluster's job server, where its storage is not seen from here."),
@@ -60,7 +68,6 @@ Seed = Annotated[int, typer.Option(help="The run's seed.")]
 
 _MODES = ("auto", "pool", "jobs")
 _WATCH_SECONDS = 1.0
-_QUEUE_SECONDS = 30.0  # between two questions to SLURM
 _UNFINISHED = 3  # the exit code of `grid status` where runs are still to be done
 
 
@@ -106,15 +113,9 @@ def grid_run(
     max_parallel: MaxParallel = None,
     address: Address = "local",
     mode: ClusterMode = "auto",
-    part: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Only runs FIRST-LAST of the manifest, counted from 0: the part of a batch system's task."),
-    ] = None,
+    part: Part = None,
     nodes: Nodes = 1,
-    stop_file: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Stop, as on a signal, once this file exists: how a batch system's script passes one on."),
-    ] = None,
+    stop_file: StopFile = None,
     digest: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option("--runs", help="Refuse a manifest whose runs have another digest than this one."),
@@ -197,15 +198,14 @@ def grid_status(
 ) -> None:
     """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
     from space_dist.experiment.status import exit_code
-    from space_dist.slurm.queue import queue_of
+    from space_dist.slurm.queue import WatchedQueue
 
     place, manifest = _found(grid, root, scale)
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
-    queue, asked = queue_of(place.folder), time.monotonic()
+    watched = WatchedQueue(place.folder)
     while True:
-        if time.monotonic() - asked >= _QUEUE_SECONDS:  # a controller serves everybody
-            queue, asked = queue_of(place.folder), time.monotonic()
+        queue = watched.now()
         found = run_statuses_of(place, manifest)
         if as_json:
             print_json(status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
@@ -339,22 +339,25 @@ def grid_work(
 
 
 def run_frozen(
-    place: Grid, manifest: Manifest, *, address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
-    nodes: int = 1, part: str | None = None,
+    place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None, *, address: str = "local", mode: Mode = "auto",
+    max_parallel: int | None = None, nodes: int = 1, part: str | None = None,
 ) -> list[RunStatus]:  # fmt: skip
-    """Work through a frozen grid with a display; returns where its runs stand in the end. For `grid run`."""
+    """Work through a frozen grid, or these runs of it, with a display; returns where they stand in the end.
+
+    part: `FIRST-LAST` of them, counted from 0.
+    """
     prepare(address)
     from space_dist.api.grids import worked_through
     from space_dist.grid.conductor import working_on
 
-    runs = _part(manifest.runs(), part)
+    chosen = _part(manifest.runs() if runs is None else runs, part)
     log_to(place)
     with contextlib.ExitStack() as stack:
         if part is None:
             stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
         observe = stack.enter_context(display(manifest, place))
         return worked_through(
-            place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
+            place, manifest, chosen, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
             stop=STOP, reinstall=STOP.install, observe=observe,
         )  # fmt: skip
 
@@ -397,7 +400,7 @@ def _number(text: str, option: str) -> int:
     return int(text)
 
 
-def _part(runs: list[Run], part: str | None) -> list[Run]:
+def _part(runs: Sequence[Run], part: str | None) -> Sequence[Run]:
     if part is None:
         return runs
     first, dash, last = part.partition("-")

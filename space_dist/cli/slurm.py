@@ -1,4 +1,4 @@
-"""Commands about SLURM: write a grid as scripts, and submit them."""
+"""Commands about SLURM: write a grid or a search as scripts, and submit them."""
 
 from __future__ import annotations
 
@@ -11,25 +11,46 @@ from typing import TYPE_CHECKING, Annotated, Optional, cast
 
 import typer
 
-from space_dist.cli.grids import GridPath
-from space_dist.cli.terminal import one_of, say, warn
+from space_dist.cli.grids import (
+    Address,
+    ClusterMode,
+    MaxParallel,
+    Nodes,
+    Part,
+    StopFile,
+    mode_of,
+    prepare,
+    run_frozen,
+)
+from space_dist.cli.overview import tell
+from space_dist.cli.terminal import STOP, one_of, say, warn
+from space_dist.cli.tuning import tell_outcome, tune_confirm
 from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.system.extras import needed_from
 
 if TYPE_CHECKING:
-    from space_dist.experiment.manifest import Manifest
+    from space_dist.experiment.manifest import Grid, Manifest
     from space_dist.slurm import Mode
 
-slurm_app = typer.Typer(no_args_is_help=True, help="The same grid as SLURM scripts.")
+slurm_app = typer.Typer(no_args_is_help=True, help="The same grid, or search, as SLURM scripts.")
 
 Interface = Annotated[Optional[str], typer.Option()]  # noqa: UP045 - typer reads annotations at run time
 
 _MODES = ("array", "cluster")
+_UNFINISHED = 3  # the exit code of `slurm advance` where something is to be submitted
 _SECONDS = 60.0  # for sbatch, which waits for a busy controller
 
 
 @slurm_app.command("export")
 def slurm_export(
-    grid: GridPath,
+    grid: Annotated[
+        Path,
+        typer.Argument(
+            metavar="GRID",
+            help="A grid's or a search's YAML file, its folder, or its manifest.json.",
+            show_default=False,
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the scripts and the frozen grid.")],
     root: Annotated[
         Optional[Path],  # noqa: UP045 - typer reads annotations at run time
@@ -62,7 +83,10 @@ def slurm_export(
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="Also have bash, shellcheck and sbatch look at them.")] = False,
 ) -> None:
-    """Write a grid as scripts that train it, check and report on it, with the exact commands. The same, every time."""
+    """Write a grid as scripts that train it, check and report on it, with the exact commands. The same, every time.
+
+    Those of a search train generation after generation, and submit the next ones themselves.
+    """
     from space_dist.slurm import Export, export, load_profile
 
     chosen = cast("Mode", one_of(_MODES, mode, "--mode"))
@@ -72,21 +96,22 @@ def slurm_export(
     settings += [] if throttle is None else [f"throttle={throttle}"]
     settings += [] if cells_per_task is None else [f"cells_per_task={cells_per_task}"]
     site = load_profile(profile, settings)
-    manifest, instances = _frozen(grid)
+    manifest, instances = _frozen(grid, out)
     made = Export(manifest, site, chosen, None if root is None else root.absolute())
     for path in export(made, instances, out, templates):
         say(str(path))
     tasks = f"{made.n_tasks} array tasks" if mode == "array" else f"one job of {site.nodes} nodes"
-    say(f"{manifest.name}: {made.n_runs} runs in {tasks}; {out / 'README.md'} says what to do with it")
+    at_most = "" if manifest.search is None else "in each generation at most "
+    say(f"{manifest.name}: {at_most}{made.n_runs} runs in {tasks}; {out / 'README.md'} says what to do with it")
     if remark := made.tracking_remark(out):
         warn(f"warning: {remark}")
     if check:
-        _check(out)
+        _check(out, made.scripts)
 
 
 @slurm_app.command("submit")
 def slurm_submit(folder: Annotated[Path, typer.Argument(metavar="DIR", help="An exported folder.")]) -> None:
-    """Submit an exported grid, or go on with it. Submitted twice, it still runs once."""
+    """Submit an exported grid or search, or go on with it. Submitted twice, it still runs once."""
     from space_dist.slurm.export import SUBMIT
 
     script = folder / SUBMIT
@@ -120,20 +145,110 @@ def slurm_node(
     raise typer.Exit(serve(head, port, cpus=cpus, temp=temp, interface=interface))
 
 
-def _frozen(path: Path) -> tuple[Manifest, Mapping[str, bytes]]:
-    """A grid that is frozen already, or frozen now from its YAML file, with its instance files."""
+@slurm_app.command("task", hidden=True)
+def slurm_task(
+    folder: Path,
+    trials: Annotated[str, typer.Option(help="The digest of the search's trials whose open runs these are.")],
+    part: Part = None,
+    stop_file: StopFile = None,
+    max_parallel: MaxParallel = None,
+    address: Address = "local",
+    mode: ClusterMode = "auto",
+    nodes: Nodes = 1,
+) -> None:
+    """Work through open runs of a search, or a part of them, as a task of a job."""
+    chosen = mode_of(mode)
+    prepare(address)
+    from space_dist.experiment.manifest import Grid
+
+    with needed_from("tune", "a search"):
+        from space_dist.slurm.searches import runs_of_task
+
+    place = Grid(folder)
+    task = runs_of_task(place, trials)
+    if task is None:
+        say(f"nothing to do: the search of {folder} has gone on since this was submitted")
+        return
+    manifest, runs = task
+    if stop_file is not None:
+        STOP.watch(stop_file, manifest.resources.grace_seconds)
+    found = run_frozen(
+        place, manifest, runs, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part
+    )  # fmt: skip
+    raise typer.Exit(tell(manifest, place, found))
+
+
+@slurm_app.command("advance", hidden=True)
+def slurm_advance(
+    search: Annotated[Path, typer.Argument(help="The search's folder, or an exported manifest.json.")],
+    plan: Annotated[Path, typer.Option("--next", help="File for what is to be submitted next.")],
+    after: Annotated[str, typer.Option(help="How far the runs were that were submitted last, or `first`.")],
+    cells_per_task: Annotated[int, typer.Option(min=1)],
+    max_array_size: Annotated[int, typer.Option(min=2)],
+    throttle: Annotated[Optional[int], typer.Option(min=1)] = None,  # noqa: UP045
+    root: Optional[Path] = None,  # noqa: UP045
+) -> None:
+    """Record what came of a search's runs. Exit codes: 0 over, and what confirms it written; 3 unfinished."""
+    from space_dist.api.tuning import in_words
+    from space_dist.experiment.manifest import find_grid
+
+    with needed_from("tune", "a search"):
+        from space_dist.slurm.searches import gone_on, next_arrays, settled_in
+
+    place = settled_in(find_grid(search, search), root)
+    manifest = gone_on(place, after, say)
+    if manifest.searched.over:
+        tell_outcome(place, manifest)
+        tune_confirm(place.folder)
+        return
+    arrays = next_arrays(place, manifest, cells_per_task, max_array_size, throttle)
+    arrays.write(plan)
+    say(f"{in_words(manifest)}: {arrays.waiting} of {arrays.runs} runs to be done")
+    raise typer.Exit(_UNFINISHED)
+
+
+def _frozen(path: Path, out: Path) -> tuple[Manifest, Mapping[str, bytes]]:
+    """A grid or search that is frozen already, or frozen now from its YAML file, with its instance files.
+
+    A search that `out` holds already, and that may have gone on, is taken from there.
+    """
     import tempfile
 
-    from space_dist.experiment.manifest import MANIFEST, find_grid
+    from space_dist import config as configs
+    from space_dist.experiment.manifest import MANIFEST, Grid, find_grid
+    from space_dist.experiment.tuning import is_search
     from space_dist.grid.planning import plan
 
     with contextlib.ExitStack() as stack:
         if path.is_dir() or path.name == MANIFEST:
             grid = find_grid(path, path)
+            if out.resolve() != grid.folder.resolve():
+                _refuse_begun(grid)
         else:
-            grid = plan(path, Path(stack.enter_context(tempfile.TemporaryDirectory()))).grid
+            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            if is_search(configs.read_yaml(configs.located(path))):
+                with needed_from("tune", "a search"):
+                    from space_dist.grid.tuning import plan_search
+                there = out if Grid(out).manifest_file.exists() else None
+                grid = plan_search(path, scratch, there).grid
+            else:
+                grid = plan(path, scratch).grid
         manifest = grid.manifest()
         return manifest, grid.instance_files(manifest)
+
+
+def _refuse_begun(grid: Grid) -> None:
+    """Raise ConfigError for a search of which runs were recorded: what it goes on from lies in its folder alone."""
+    manifest = grid.manifest()
+    if manifest.search is None:
+        return
+    with needed_from("tune", "a search"):
+        from space_dist.slurm.searches import has_begun
+    if has_begun(manifest):
+        raise ConfigError(
+            f"{grid.folder} holds a search that has begun, and goes on from its runs: export it to its own folder, "
+            f"with --out {grid.folder}"
+        )
 
 
 def _bash() -> str:
@@ -143,14 +258,12 @@ def _bash() -> str:
     return found
 
 
-def _check(folder: Path) -> None:
+def _check(folder: Path, scripts: tuple[str, str, str]) -> None:
     """Raises SpaceDistError for the first objection; says which of the three could not be asked."""
-    from space_dist.slurm.export import AGGREGATE, SUBMIT, TRAIN
-
     commands: list[tuple[str, list[str], tuple[str, ...]]] = [
-        ("bash", ["-n"], (TRAIN, AGGREGATE, SUBMIT)),
-        ("shellcheck", [], (TRAIN, AGGREGATE, SUBMIT)),
-        ("sbatch", ["--test-only"], (TRAIN, AGGREGATE)),
+        ("bash", ["-n"], scripts),
+        ("shellcheck", [], scripts),
+        ("sbatch", ["--test-only"], scripts[:2]),
     ]
     for program, options, files in commands:
         path = shutil.which(program)

@@ -106,14 +106,7 @@ def tune_run(
             place, observing=lambda manifest: display(manifest, place), stop=STOP, address=address, mode=chosen,
             max_parallel=max_parallel, nodes=nodes, reinstall=STOP.install, say=say,
         )  # fmt: skip
-    search = _search_of(place, manifest)
-    _print_failed(search)
-    say(f"{_summary(manifest, search)}. {place.folder}")
-    none = [arm for arm in search.arms if search.best(arm) is None]
-    for arm in none:
-        warn(f"arm {arm} has no complete trial, and so nothing to confirm")
-    if none:
-        raise typer.Exit(_FAILED)
+    tell_outcome(place, manifest)
     say(f"`space-dist tune confirm {place.folder}` writes the grid that tells what it is worth")
 
 
@@ -127,16 +120,20 @@ def tune_status(
 ) -> None:
     """Where every trial stands. Exit codes: 0 over, 1 held up by failures, 3 unfinished."""
     from space_dist.experiment.tuning import find_tune
+    from space_dist.slurm.queue import WatchedQueue
 
     place = find_tune(tune, root_of(root))
+    watched = WatchedQueue(place.folder)
     while True:
+        queue = watched.now()
         manifest = place.manifest()
         search = _search_of(place, manifest)
         waiting = {trial.cell for trial in search.open}
         found = run_statuses_of(place, manifest, [run for run in manifest.runs() if run.cell.id in waiting])
         settled = bool(found) and all(one.condition in ("done", "failed") for one in found)
         if as_json:
-            print_json({"folder": str(place.folder), "owner_alive": place.owner_alive()} | _numbers(search))
+            told = {"folder": str(place.folder), "owner_alive": place.owner_alive()} | _numbers(search)
+            print_json(told | ({} if queue is None else {"slurm": queue.to_json()}))
         else:
             if watch and console.is_terminal:
                 console.clear()
@@ -144,8 +141,9 @@ def tune_status(
             print_failures(found, by_cause)
             say(_summary(manifest, search))
             if found:
-                say(f"now: {summary(manifest, found)}{workers_in_words(place, None)}")
-        held_up = settled and any(one.condition == "failed" for one in found) and not place.owner_alive()
+                say(f"now: {summary(manifest, found)}{workers_in_words(place, queue)}")
+        idle = not place.owner_alive() and not (queue and queue.live)
+        held_up = settled and any(one.condition == "failed" for one in found) and idle
         if not watch or output_left() or search.over or held_up:
             raise typer.Exit(0 if search.over else _FAILED if held_up else _UNFINISHED)
         time.sleep(_WATCH_SECONDS)
@@ -189,6 +187,18 @@ def tune_confirm(tune: TunePath, root: Root = None) -> None:
         best = search.best(arm)
         say(f"{arm}: trial {best.number if best is not None else ''}")
     say(f"`space-dist grid run {written} --root {place.folder.parent}` runs it; `space-dist tune report` shows it")
+
+
+def tell_outcome(place: Grid, manifest: Manifest) -> None:
+    """Say how a search ended. Raises typer.Exit if an arm has nothing to confirm."""
+    search = _search_of(place, manifest)
+    _print_failed(search)
+    say(f"{_summary(manifest, search)}. {place.folder}")
+    none = [arm for arm in search.arms if search.best(arm) is None]
+    for arm in none:
+        warn(f"arm {arm} has no complete trial, and so nothing to confirm")
+    if none:
+        raise typer.Exit(_FAILED)
 
 
 # ---- parts ----------------------------------------------------------------------------------------------------------

@@ -312,20 +312,31 @@ def working_on(
     Interrupted if asked to stop while waiting, RunLockedError at once if not to `wait`, LedgerError if the folder
     cannot be written.
     """
-    lock = _acquired(grid, wait, stop_requested, say)
     pusher = None
     try:
-        grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
-        if manifest.tracking.anywhere:
-            pusher = Pusher(manifest.tracking, grid.folder, grid.tracking_log)
-        yield
-    finally:
-        lock.release()  # by which the pusher knows that it may end
+        with owning(grid, wait=wait, stop_requested=stop_requested, say=say):
+            grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
+            if manifest.tracking.anywhere:
+                pusher = Pusher(manifest.tracking, grid.folder, grid.tracking_log)
+            yield
+    finally:  # the lock is released, by which the pusher knows that it may end
         if pusher is not None:
             if warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid"):
                 say(f"warning: {warning}")
             for page in pusher.pages():
                 say(f"{LOOK_AT}{page}")
+
+
+@contextlib.contextmanager
+def owning(
+    grid: Grid, *, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
+) -> Iterator[None]:
+    """Be the only one who may change the grid's folder, once whoever does so now is gone. Raises as `working_on`."""
+    lock = _acquired(grid, wait, stop_requested, say)
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _acquired(

@@ -61,14 +61,15 @@ class SearchPlan:
     new: bool
 
 
-def plan_search(path: Path, root: Path) -> SearchPlan:
-    """Check a search's file, and freeze it with its first generation in `<root>/<name>`; one that is there goes on.
+def plan_search(path: Path, root: Path, folder: Path | None = None) -> SearchPlan:
+    """Check a search's file, and freeze it with its first generation; one that is there goes on.
 
-    Raises ConfigError for every fault of the files: keys that are none, values that no setting can have, instance sets
-    that share contexts; and if the folder holds another search, or a grid.
+    folder: of the search; None: `<root>/<name>`. Raises ConfigError for every fault of the files: keys that are none,
+    values that no setting can have, instance sets that share contexts; and if the folder holds another search, or a
+    grid.
     """
     config = load_tune(path)
-    grid = Grid(root.absolute() / config.name)
+    grid = Grid(root.absolute() / config.name if folder is None else folder)
     begun = _begun(grid)
     files = InstanceFiles()
     with about(str(path)):

@@ -21,13 +21,17 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from space_dist.config import clean
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.manifest import Grid, Manifest
+from space_dist.slurm.arrays import Array, arrays_of
 from space_dist.slurm.profile import Profile, variables_in
 from space_dist.system.files import atomic_write
 
 Mode = Literal["array", "cluster"]
-TRAIN, AGGREGATE, SUBMIT, README = "train.sbatch", "aggregate.sbatch", "submit.sh", "README.md"
+TRAIN, SUBMIT, README = "train.sbatch", "submit.sh", "README.md"
+AGGREGATE = "aggregate.sbatch"  # once, after a grid's training
+ADVANCE = "advance.sbatch"  # after each generation of a search
+NEXT = "slurm_next.txt"  # in a search's folder: what is to be submitted next, while that is being done
 JOBS = "slurm_jobs.txt"  # in the grid's folder: `<job id> <what it is>` a line, of the last submission
-_MAX_CHUNKS = 1000
+_MAX_ARRAYS = 1000
 _CHECKPOINT_SECONDS = 10  # beside the grace time: to notice the signal, and to get back into the queue
 _PLAIN = re.compile(r"[A-Za-z0-9@%+,.:/_-]+")
 
@@ -40,7 +44,7 @@ class _Safe(str):
 
 @dataclass(frozen=True)
 class Export:
-    """How a grid runs on SLURM. root: absolute; None: the grid's folder is the one that holds the scripts.
+    """How a grid, or a search, runs on SLURM. root: absolute; None: its folder is the one that holds the scripts.
 
     Raises ConfigError for what does not go together.
     """
@@ -57,11 +61,6 @@ class Export:
                 f"signal.lead_seconds: {lead} is too short for resources.grace_seconds of {self.manifest.name}; "
                 f"it must be at least {need:g}"
             )
-        if self.manifest.search is not None:
-            raise ConfigError(
-                f"{self.manifest.name} is a search, whose runs are not known before it is over, and scripts are of "
-                "runs that are known; `space-dist tune run` can be the command of a job"
-            )
         if self.cpus < self.manifest.cpus_per_run:
             raise ConfigError(
                 f"cpus_per_task: {self.cpus} are too few: each run of {self.manifest.name} needs "
@@ -71,8 +70,8 @@ class Export:
             raise ConfigError("cells_per_task is for array mode; in cluster mode all nodes work on all runs")
         if self.root is not None and not (self.root.is_absolute() and str(self.root).isprintable()):
             raise ConfigError(f"--root {clean(str(self.root))!r}: an absolute path of printable characters is needed")
-        if len(self.chunks) > _MAX_CHUNKS:
-            raise ConfigError(f"{len(self.chunks):,} arrays are too many; raise cells_per_task")
+        if len(self.arrays) > _MAX_ARRAYS:
+            raise ConfigError(f"{len(self.arrays):,} arrays are too many; raise cells_per_task")
 
     @property
     def cpus(self) -> int:
@@ -94,13 +93,22 @@ class Export:
 
     @property
     def n_runs(self) -> int:
-        """All of the grid's."""
-        return len(self.manifest.runs())
+        """All of the grid's; of a search, as many as a generation has at most."""
+        search = self.manifest.search
+        if search is None:
+            return len(self.manifest.runs())
+        trials = min(int(search.config["generation"]), int(search.config["trials"]))
+        return trials * len(search.arms) * len(self.manifest.seeds)
 
     @property
     def n_tasks(self) -> int:
-        """Array tasks in all."""
+        """Array tasks for so many runs."""
         return -(-self.n_runs // self.profile.cells_per_task)
+
+    @property
+    def scripts(self) -> tuple[str, str, str]:
+        """What is submitted for training, what after it, and what submits them."""
+        return TRAIN, AGGREGATE if self.manifest.search is None else ADVANCE, SUBMIT
 
     @property
     def parallel(self) -> int:
@@ -108,28 +116,30 @@ class Export:
         return min(self.profile.cells_per_task, self.cpus // self.manifest.cpus_per_run)
 
     @property
-    def chunks(self) -> list[tuple[int, int]]:
-        """First task and number of tasks of each array: MaxArraySize bounds the largest index, not only the size."""
-        size = self.profile.max_array_size
-        return [(first, min(size, self.n_tasks - first)) for first in range(0, self.n_tasks, size)]
-
-    def array(self, count: int) -> str:
-        """Value of `--array`: `0-99%4`."""
-        throttle = self.profile.throttle
-        return f"0-{count - 1}" + (f"%{throttle}" if throttle is not None else "")
+    def arrays(self) -> list[Array]:
+        """All tasks."""
+        return arrays_of(range(self.n_tasks), self.profile.max_array_size, self.profile.throttle)
 
     @property
     def job_name(self) -> str:
         """Of the training jobs."""
         return self.profile.job_name or self.manifest.name
 
+    @property
+    def begins_after(self) -> str:
+        """What the first job of a search waits for: that of an earlier submission, too, which has the same name."""
+        own = self.profile.dependency
+        # SLURM takes "all of" (,) or "any of" (?), never both.
+        return "singleton" if own is None else own if "?" in own else f"{own},singleton"
+
     def train_directives(self) -> Iterator[str]:
         """The `#SBATCH` lines of training."""
         profile = self.profile
         yield _directive("job-name", self.job_name)
         yield from self._common(aggregate=False)
-        yield from _optional({"nodelist": profile.nodelist, "exclude": profile.exclude,
-                              "dependency": profile.dependency})  # fmt: skip
+        yield from _optional({"nodelist": profile.nodelist, "exclude": profile.exclude})
+        if self.manifest.search is None:  # what a search waits for, its first job does
+            yield from _optional({"dependency": profile.dependency})
         yield _directive("nodes", profile.nodes if self.mode == "cluster" else 1)
         yield _directive("ntasks-per-node", 1)
         yield _directive("cpus-per-task", self.cpus)
@@ -143,14 +153,14 @@ class Export:
         yield _directive("requeue", None)
         # B: to the batch script alone, which tells the runs and decides about requeueing.
         yield _directive("signal", f"B:{profile.signal.name}@{profile.signal.lead_seconds}")
-        if self.mode == "array":
-            yield _directive("array", self.array(self.chunks[0][1]))
+        if self.mode == "array" and self.manifest.search is None:
+            yield _directive("array", self.arrays[0].indices)
         yield from self._extra()
 
     def aggregate_directives(self) -> Iterator[str]:
-        """The `#SBATCH` lines of the job that checks and reports."""
+        """The `#SBATCH` lines of the job that checks and reports, or that has a search go on."""
         own = self.profile.aggregate
-        yield _directive("job-name", f"{self.job_name}-aggregate")
+        yield _directive("job-name", f"{self.job_name}-{PurePosixPath(self.scripts[1]).stem}")
         yield from self._common(aggregate=True)
         yield _directive("nodes", 1)
         yield _directive("ntasks-per-node", 1)
@@ -158,6 +168,8 @@ class Export:
         yield from _optional({"time": own.time or self.profile.time, "mem": own.mem})
         yield from self._outputs(array=False)
         yield _directive("open-mode", "append")
+        if self.manifest.search is not None:  # which would end with it
+            yield _directive("requeue", None)
         yield from self._extra()
 
     def _common(self, *, aggregate: bool) -> Iterator[str]:
@@ -193,16 +205,13 @@ def export(
 ) -> list[Path]:  # fmt: skip
     """Write the scripts, their README and the frozen grid into `folder`; returns the files, the manifest's last.
 
-    Raises ConfigError if the folder holds another grid, or cannot be written.
+    A search that is there already, and may have gone on, stays as it is. Raises ConfigError if the folder holds another
+    grid or search, or cannot be written.
     """
     there = Grid(folder)
-    if there.manifest_file.exists():
-        try:
-            other = there.manifest().runs_digest != grid.manifest.runs_digest
-        except LedgerError:
-            other = True
-        if other:
-            raise ConfigError(f"{folder} holds another grid; --out names another folder")
+    known = there.manifest_file.exists()
+    if known and not _holds(there, grid.manifest):
+        raise ConfigError(f"{folder} holds another grid or search; --out names another folder")
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -214,8 +223,27 @@ def export(
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
     # Last: a folder with a manifest has all its scripts.
-    there.freeze(grid.manifest, instances)
+    if not known or grid.manifest.search is None:
+        there.freeze(grid.manifest, instances)
     return [*written, there.manifest_file]
+
+
+def _holds(there: Grid, manifest: Manifest) -> bool:
+    """Whether a folder holds this grid, or this search, however far it is."""
+    try:
+        before = there.manifest()
+    except LedgerError:
+        return False
+    if manifest.search is not None or before.search is not None:
+        return same_search(before, manifest)
+    return before.runs_digest == manifest.runs_digest
+
+
+def same_search(one: Manifest, other: Manifest) -> bool:
+    """Whether both are of one search, however far each of them is."""
+    if one.search is None or other.search is None:
+        return False
+    return (one.name, one.seeds, one.search.with_trials(())) == (other.name, other.seeds, other.search.with_trials(()))
 
 
 def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
@@ -225,8 +253,9 @@ def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
     """
     shell = _environment(templates)
     _refuse_variables(grid.profile, templates)
-    files = {TRAIN: f"{grid.mode}.sbatch.j2", AGGREGATE: "aggregate.sbatch.j2", SUBMIT: "submit.sh.j2",
-             README: "README.md.j2"}  # fmt: skip
+    training, after, submitting = grid.scripts
+    files = {training: f"{grid.mode}.sbatch.j2", after: f"{after}.j2", submitting: f"{submitting}.j2",
+             README: f"{README}.j2"}  # fmt: skip
     values = _values(grid)
     texts = {}
     for name, template in files.items():
@@ -287,11 +316,15 @@ def _values(grid: Export) -> dict[str, Any]:
         "name": manifest.name, "mode": grid.mode, "job_name": grid.job_name, "digest": manifest.runs_digest,
         "n_runs": grid.n_runs, "n_cells": len(manifest.cells), "n_seeds": len(manifest.seeds),
         "n_tasks": grid.n_tasks, "per_task": profile.cells_per_task, "parallel": grid.parallel,
-        "chunks": [{"first": first, "array": grid.array(count)} for first, count in grid.chunks],
+        "arrays": [array._asdict() for array in grid.arrays], "max_array_size": profile.max_array_size,
+        "search": manifest.search is not None, "kind": "grid" if manifest.search is None else "search",
+        "n_trials": 0 if manifest.search is None else manifest.search.total,
+        "begins_after": grid.begins_after,
         "throttle": profile.throttle, "cpus": grid.cpus, "nodes": profile.nodes,
         "train_directives": [_Safe(line) for line in grid.train_directives()],
         "aggregate_directives": [_Safe(line) for line in grid.aggregate_directives()],
-        "root": None if grid.root is None else str(grid.root), "log_folders": grid.log_folders(), "jobs": JOBS,
+        "root": None if grid.root is None else str(grid.root), "log_folders": grid.log_folders(),
+        "jobs": JOBS, "next": NEXT,
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
         "sync": manifest.tracking.anywhere,

@@ -23,7 +23,7 @@ _NAME = r"[A-Za-z_][A-Za-z0-9_]*"
 _VARIABLE = re.compile(_NAME)
 # A variable that a script sets, reads or unsets: `name=`, `${name`, `read -t name`, and those below.
 _USED = re.compile(
-    rf"(?<![\w$-])({_NAME})(?:\[[^]]*\])?\+?=|\$\{{?[#!]?({_NAME})|(?<![\w-])(?:mapfile|unset|export)((?: -?\w+)+)"
+    rf"(?<![\w$-])({_NAME})(?:\[[^]]*\])?\+?=|\$\{{?[#!]?({_NAME})|(?<![\w-])(?:mapfile|unset|export|read)((?: -?\w+)+)"
 )
 _COMMENT = re.compile(r"^\s*#.*$", re.MULTILINE)
 # Bash's own: read-only, or set by itself, or a change of how it reads what follows.

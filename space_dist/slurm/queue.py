@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from typing import Any
 from space_dist.config import clean
 from space_dist.slurm.export import JOBS
 
+_AGAIN_SECONDS = 30.0  # between two questions to SLURM: a controller serves everybody
 _SECONDS = 20.0  # for squeue and sacct, whose controller may be busy or gone
 _MAX_BYTES = 1 << 20
 
@@ -61,6 +63,20 @@ def queue_of(folder: Path) -> Queue | None:
     return Queue(jobs, said is not None, live, ended)
 
 
+class WatchedQueue:
+    """The same, for whoever looks again and again."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._asked = folder, time.monotonic()
+        self._known = queue_of(folder)
+
+    def now(self) -> Queue | None:
+        """Half a minute old at most."""
+        if time.monotonic() - self._asked >= _AGAIN_SECONDS:
+            self._asked, self._known = time.monotonic(), queue_of(self._folder)
+        return self._known
+
+
 def _jobs(folder: Path) -> dict[str, tuple[str, ...]]:
     try:
         text = (folder / JOBS).read_text()[:_MAX_BYTES]
@@ -69,7 +85,7 @@ def _jobs(folder: Path) -> dict[str, tuple[str, ...]]:
     jobs: dict[str, tuple[str, ...]] = {}
     for line in text.splitlines():
         number, _, kind = line.partition(" ")
-        if number.isdecimal() and number.isascii() and kind in ("train", "aggregate"):
+        if number.isdecimal() and number.isascii() and kind in ("train", "aggregate", "advance"):
             jobs[kind] = (*jobs.get(kind, ()), number)
     return jobs
 

@@ -33,7 +33,7 @@ trap undo EXIT
 
 # Submits with the arguments after the first, which says what it is; sets `job`.
 submit() {
-  job=$(sbatch --parsable "${@:2}")
+  job=$(sbatch --parsable "${@:2}") || exit
   job=${job%%;*} # of several clusters the name follows
   submitted+=("$job")
   echo "$job $1" >>"$jobs.new"
