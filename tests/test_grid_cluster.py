@@ -16,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from space_dist.api.tuning import run_search
 from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import Grid, Run
 from space_dist.experiment.status import Attempts
@@ -25,6 +26,7 @@ from space_dist.run.launch import launch, stored_config
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import private_ray
 from tests.grids import ROOT, write_grid
+from tests.test_tuning_runs import tiny_tune
 
 sys.path.append(str(ROOT / "jobs"))
 
@@ -43,6 +45,14 @@ def cluster() -> Iterator[RayHead]:
             yield head
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def searched_here(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Grid]:
+    """The file of a search of two generations, and that search, run on no cluster."""
+    folder = tmp_path_factory.mktemp("searched")
+    path = tiny_tune(folder, arms={"a": {}}, pruner={"rungs": [1], "keep": 0.5})
+    return path, run_search(path, root=folder / "runs", progress=False).grid
 
 
 def start(cluster: RayHead, *arguments: object) -> subprocess.Popen[str]:
@@ -122,6 +132,28 @@ def test_a_killed_conductor_and_a_killed_submitter_change_nothing(cluster: RayHe
     assert finished_once == [1] * 4
     if mode == "jobs":  # they outlive their conductor
         assert begun(grid, runs) == [1] * 4
+
+
+@pytest.mark.parametrize("mode", ["pool", "jobs"])
+def test_a_search_ends_as_it_does_without_a_cluster(
+    cluster: RayHead, searched_here: tuple[Path, Grid], tmp_path: Path, mode: str
+) -> None:
+    path, here = searched_here
+    process = subprocess.Popen(
+        [sys.executable, "-m", "space_dist.cli", "tune", "run", path, "--root", tmp_path / "runs", "--address", "auto",
+         "--mode", mode],
+        env={**cluster.environment, "RAY_ADDRESS": cluster.cluster}, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    said = process.communicate(timeout=PATIENCE)[0]
+    assert process.returncode == 0, said
+    grid = Grid(tmp_path / "runs/search")
+    assert grid.manifest_file.read_bytes() == here.manifest_file.read_bytes()
+    runs = grid.manifest().runs()
+    assert begun(grid, runs) == [1] * len(runs)
+    assert metrics(grid, runs) == metrics(here, runs)
+    jobs = [job for job in cluster.ask("/api/jobs/") if (job["metadata"] or {}).get("folder") == str(grid.folder)]
+    assert bool(jobs) is (mode == "jobs")
 
 
 def test_a_root_that_nodes_do_not_share_is_refused(cluster: RayHead, tmp_path: Path) -> None:

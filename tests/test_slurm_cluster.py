@@ -1,6 +1,7 @@
-"""Grids on a real Slurm of two nodes, which these tests start: preempted, out of time, failing, short of a node.
+"""Grids and a search on a real Slurm of two nodes, which these tests start: preempted, out of time, short of a node.
 
-Every test compares with `grid run` of the same grid here: the same `metrics.jsonl`, byte for byte.
+Every test compares with `grid run` of the same grid here: the same `metrics.jsonl`, byte for byte; that of a search
+with `tune run`: the same `manifest.json`.
 """
 
 from __future__ import annotations
@@ -142,6 +143,20 @@ def write_grid(folder: Path, name: str, *, seeds: tuple[int, ...], **more: objec
         "resources": {"grace_seconds": 20.0}, **more,
     }))  # fmt: skip
     return folder / f"{name}.yaml"
+
+
+def write_search(folder: Path) -> Path:
+    """Two arms of two trials on the gated line, in two generations."""
+    grid = write_grid(folder, "unused", seeds=(0,))
+    (folder / "final.csv").write_text("id,target\n0,-0.5\n1,0.6\n")
+    grid.with_name("search.yaml").write_text(to_yaml({
+        "name": "search", "extends": "run.yaml", "trials": 2, "generation": 1, "seeds": [0, 1],
+        "search": {"learner.learning_rate": {"float": [1.0e-4, 1.0e-2], "log": True}},
+        "arms": {"space": {}, "robin": {"set": {"curriculum": {"kind": "round_robin"}}}},
+        "confirm": {"seeds": [9], "instances": {"test": "final.csv"}},
+        "tracking": {"uri": None}, "resources": {"grace_seconds": 20.0},
+    }))  # fmt: skip
+    return grid.with_name("search.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -298,6 +313,27 @@ def test_what_the_page_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> No
     slurm.ask("scancel", *jobs)
 
 
+@executes(("tuning.md", 1))
+def test_what_the_page_of_searches_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> None:
+    """Its block, in small; of what it submits nothing begins to train."""
+    write_small_configs(tmp_path / "configs")
+    (tmp_path / "configs/slurm/site.yaml").write_text(to_yaml({"mem": 1500, "temp": "/var/tmp"}))  # noqa: S108
+    script = bash_blocks("tuning.md")[1]
+    for old, new in (("/shared", f"{tmp_path}/shared"), ("submit.sh ", "submit.sh --hold "),
+                     ("\nspace-dist tune status", "\nspace-dist tune status --json")):  # fmt: skip
+        assert old in script
+        script = script.replace(old, new)
+    command = f"{sys.executable} -P -m space_dist.cli"
+    done = subprocess.run(
+        ["bash", "-c", f'set -e\nspace-dist() {{ {command} "$@" || [ $? = 3 ]; }}\n{script}'],
+        cwd=tmp_path, env=slurm.environment, capture_output=True, text=True, timeout=PATIENCE,
+    )  # fmt: skip
+    slurm.ask("scancel", "--user=root")
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout[done.stdout.index("{") :])
+    assert (told["over"], [*told["slurm"]["jobs"]]) == (False, ["advance"])
+
+
 def test_a_failing_cell_blocks_nothing_and_is_named(slurm: Slurm, tmp_path: Path) -> None:
     kwargs = {"env.kwargs": [{"fails": True}, {"fails": False}]}
     grid = write_grid(tmp_path / "written", "two", seeds=(0,), grid=kwargs)
@@ -338,6 +374,58 @@ def test_one_ray_over_two_nodes_survives_the_loss_of_one(slurm: Slurm, reference
     assert_same_results(folder, reference)
     for node in (1, 2):
         await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
+
+
+def test_a_search_survives_being_cancelled_and_the_loss_of_a_node(slurm: Slurm, tmp_path: Path) -> None:
+    """Submitted twice, its array and the job after it cancelled, a node killed, the job between two arrays requeued."""
+    gate, path = tmp_path / "gate", write_search(tmp_path / "written")
+    space_dist("tune", "run", path, "--root", tmp_path / "here")
+    gate.touch()
+    folder = export(
+        path, tmp_path / "grid", gate, "--check", "--cells-per-task", 2, slurm=slurm,
+        python_path=f"{HERE / 'short_lease'}:{ROOT}",
+    )  # fmt: skip
+    grid = Grid(folder)
+
+    def submit() -> list[str]:
+        said = space_dist("slurm", "submit", folder, slurm=slurm)
+        assert "already in the queue" in space_dist("slurm", "submit", folder, slurm=slurm)
+        [first] = [line.split()[-1] for line in said.splitlines() if line.startswith("advance: job")]
+        await_(lambda: slurm.job(first)["JobState"] == "COMPLETED", "the array to be submitted", folder)
+        jobs = [line.split() for line in (folder / JOBS).read_text().splitlines()]
+        assert [kind for _, kind in jobs] == ["train", "advance"]
+        return [job for job, _ in jobs]
+
+    def running() -> int:
+        return sum(under_way(grid.ledger(run)) for run in grid.manifest().runs())
+
+    jobs = submit()
+    await_(lambda: running() == 2, "two runs to be under way", folder)
+    slurm.ask("scancel", *jobs)
+    await_(lambda: slurm.ask("squeue", "--noheader") == "", "the queue to be empty", folder)
+    train, advance = submit()
+    await_(lambda: running() == 2 and hosts(folder) == {"n1", "n2"}, "both nodes to be at work", folder)
+    os.kill(slurm.node_holder(2), signal.SIGKILL)
+    await_(
+        lambda: "1" in {slurm.job(f"{train}_{number}").get("Restarts") for number in (0, 1)}, "a requeue", folder
+    )  # fmt: skip
+    gate.unlink()
+    subprocess.run([HERE / "up.sh", slurm.folder, "node", "2"], check=True, timeout=PATIENCE)
+    await_(lambda: slurm.job(advance)["JobState"] == "COMPLETED", "the next generation", folder)
+    slurm.ask("scontrol", "requeue", advance)  # it is done, and finds so
+    await_(
+        lambda: grid.manifest().searched.over and slurm.ask("squeue", "--noheader") == "", "the search to end", folder
+    )  # fmt: skip
+    here = Grid(tmp_path / "here/search")
+    assert grid.manifest_file.read_bytes() == here.manifest_file.read_bytes()
+    for run in here.manifest().runs():
+        assert (grid.ledger(run).folder / METRICS).read_bytes() == (here.ledger(run).folder / METRICS).read_bytes()
+    assert (folder / "confirm/search-confirm.yaml").is_file()
+    assert (folder / "report/report.html").is_file()
+    logs = "".join(log.read_text() for log in folder.glob("logs/search-advance-*.out"))
+    assert "writes the grid" not in logs  # which it has done itself
+    assert "4 of 4 trials asked: 4 complete" in logs
+    assert space_dist("tune", "status", folder, slurm=slurm)
 
 
 def test_sbatch_reads_hostile_values_as_text(slurm: Slurm, reference: Grid, tmp_path: Path) -> None:

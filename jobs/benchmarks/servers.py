@@ -99,7 +99,8 @@ class _Server:
 class RayHead(_Server):
     """`ray start --head`: never `ray stop`, which would end other people's, too.
 
-    temp: Ray's own folder; its path must be short, since sockets lie in it. `environment` is for whoever submits.
+    temp: Ray's own folder; its path must be short, since sockets lie in it. `environment` is for whoever submits;
+    `cluster` is the RAY_ADDRESS of whoever joins.
     """
 
     name = "Ray"
@@ -107,7 +108,7 @@ class RayHead(_Server):
     def __init__(self, temp: Path, cpus: int, environment: Mapping[str, str], output: Path) -> None:
         token, binaries = secrets.token_hex(32), Path(sys.executable).parent
         ports = free_ports(3)
-        self.address = f"http://127.0.0.1:{ports[1]}"
+        self.address, self.cluster = f"http://127.0.0.1:{ports[1]}", f"127.0.0.1:{ports[0]}"
         self.environment = {
             **environment, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token, "RAY_USAGE_STATS_ENABLED": "0",
             "PATH": f"{binaries}{os.pathsep}{environment['PATH']}",

@@ -76,7 +76,7 @@ class Notice(Section):
 
 
 class Aggregation(Section):
-    """What the job that checks and reports in the end needs, where that differs from training."""
+    """What the job that checks and reports in the end, or has a search go on, needs where it differs from training."""
 
     partition: Word | None = None
     qos: Word | None = None
