@@ -203,7 +203,7 @@ def _search_of(place: Grid, manifest: Manifest) -> Search:
 def _summary(manifest: Manifest, search: Search) -> str:
     counts = Counter(trial.state for trial in search.trials)
     parts = [f"{count} {state}" for state, count in sorted(counts.items())]
-    return f"{manifest.name}: {len(search.trials)} of {search.total} trials asked: {', '.join(parts)}"
+    return f"{manifest.name}: {search.asked} of {search.total} trials asked: {', '.join(parts)}"
 
 
 def _print_trials(search: Search, cells: list[str]) -> None:
