@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -23,17 +25,19 @@ from tests.tunes import RATE, write_tune
 KILLS = 5
 
 
-def tiny_tune(folder: Path, **sections: Any) -> Path:
+def tiny_tune(folder: Path, changes: Mapping[str, Any] = MappingProxyType({}), /, **sections: Any) -> Path:
     """A search on the line, whose runs take a moment: two arms of four trials, in generations of two."""
     folder.mkdir(exist_ok=True, parents=True)
     instances = write_line_instances(folder)
     final = folder / "final.csv"
     final.write_text("id,target\n0,-0.55\n1,0.15\n2,0.75\n")
     settings = {**TINY, "env": {"id": "tests.tiny_env:make"}, "engine": "auto", "checkpoint.every_rounds": 1}
-    return write_tune(
-        folder, set={**settings, **instances}, trials=4, seeds=[0, 1], retry={"killed": 100, "preempted": 100},
-        confirm={"seeds": [9], "instances": {"test": str(final)}}, **sections,
-    )  # fmt: skip
+    defaults = {
+        "set": {**settings, **instances, **changes}, "trials": 4, "seeds": [0, 1],
+        "retry": {"killed": 100, "preempted": 100},
+        "confirm": {"seeds": [9], "instances": {"test": str(final)}},
+    }  # fmt: skip
+    return write_tune(folder, **{**defaults, **sections})
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
 from space_dist.config import NAME, Section
@@ -180,15 +180,19 @@ class Pruner(Section):
     """halving: at each rung the best share of an arm's generation goes on (successive halving; Optuna's own depends on
     who ends first). median: Optuna's: whoever is below the median, at this rung, of the arm's complete trials does not
     go on."""
-    rungs: tuple[Annotated[int, Field(ge=1)] | Rung, ...] = Field(
-        default=(1,), strict=False, min_length=1, max_length=100
-    )
+    rungs: tuple[Rung, ...] = Field(default=(Rung(seeds=1),), strict=False, min_length=1, max_length=100)
     """Where trials are compared, ascending: after so many seeds, fewer than `seeds`; or after so many seeds and so many
     steps of each, like {seeds: 1, steps: 40960}. Runs that are paused at a rung go on from there."""
     keep: float = Field(default=1 / 3, gt=0.0, lt=1.0)
     """Of halving: the share that goes on, rounded up. Source: a third is Hyperband's (Li et al. 2018)."""
     startup: int = Field(default=5, ge=1)
     """Of median: so many trials of an arm are complete before any is given up. Source: Optuna's default."""
+
+    @field_validator("rungs", mode="before")
+    @classmethod
+    def _seeds_alone(cls, value: Any) -> Any:
+        given = list(value) if isinstance(value, list | tuple) else value
+        return [{"seeds": one} if type(one) is int else one for one in given] if isinstance(given, list) else given
 
 
 class Population(Section):
@@ -279,12 +283,12 @@ class TuneConfig(Section):
         if len(self.arms) * self.trials * len(ours) > MAX_RUNS:
             raise ValueError(f"more than {MAX_RUNS:,} runs; a search may have that many")
         if self.pruner is not None:
-            self._refuse_rungs([rung if isinstance(rung, int) else str(rung) for rung in self.pruner.rungs])
+            self._refuse_rungs("; ".join(map(str, self.pruner.rungs)))
         if self.population is not None:
             self._refuse_other_ways()
         return self
 
-    def _refuse_rungs(self, shown: list[Any]) -> None:
+    def _refuse_rungs(self, shown: str) -> None:
         *rungs, last = self.rungs(0)
         many = len(self.seed_list())
         ascending = all(one.precedes(other) for one, other in pairwise([*rungs, last]))
@@ -351,8 +355,7 @@ class TuneConfig(Section):
         if self.population is not None:
             each = self.population.every_steps
             return [*(Rung(steps=steps) for steps in range(each, budget, each)), WHOLE]
-        given = () if self.pruner is None else self.pruner.rungs
-        rungs = [Rung(seeds=rung) if isinstance(rung, int) else rung for rung in given]
+        rungs = () if self.pruner is None else self.pruner.rungs
         return [*(rung.model_copy(update={"seeds": 0 if rung.seeds == many else rung.seeds}) for rung in rungs), WHOLE]
 
     @property
