@@ -220,6 +220,25 @@ def test_a_member_that_fails_is_replaced(tmp_path: Path) -> None:
     assert len(heirs_of(search, "a")) >= len(failed)
 
 
+def test_status_tells_whose_copies_there_are(evolved: tuple[Path, Grid]) -> None:
+    command = [sys.executable, "-m", "space_dist.cli", "tune", "status", str(evolved[1].folder)]
+    table, told = (
+        subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
+        for more in ([], ["--json"])
+    )
+    heads = next(line for line in table.splitlines() if "trial" in line)
+    assert heads.replace("┃", " ").split() == ["arm", "trial", "from", "state", "seeds", "steps", "setting"]
+    trials = json.loads(told)["trials"]
+    assert sum(trial["parent"] is not None for trial in trials) == 6
+    assert {trial["steps"] for trial in trials} == {None, 256, 512, 768}
+    assert all(len(trial["values"]) >= 1 for trial in trials)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs/tune").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_search_of_the_repository_can_be_planned(path: Path, tmp_path: Path) -> None:
+    assert plan_search(path, tmp_path).manifest.search is not None
+
+
 # ---- what is refused ------------------------------------------------------------------------------------------------
 
 
