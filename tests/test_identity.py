@@ -87,7 +87,7 @@ def candidates(config: RunConfig, key: str, value: Any) -> list[Any]:
     if isinstance(value, int | float):
         return [value * 2 or 1, value / 2 or 0.5, *words]
     if isinstance(value, list):
-        return [[32, 32], ["effort"], ["wandb"]]
+        return [[32, 32], ["effort"], ["wandb"], [{"steps": 1, "set": {"learner.gamma": 0.5}}]]
     return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1, [0.5, 0.5], ["a"]]
 
 

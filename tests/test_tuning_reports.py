@@ -17,6 +17,7 @@ from space_dist.experiment.sampling import draw, importance
 from space_dist.experiment.search import Search, Trial
 from space_dist.grid.planning import plan
 from space_dist.grid.tuning import advance, confirmation, open_runs, plan_search
+from space_dist.ledger import Ledger
 from space_dist.report import build_grid_report
 from space_dist.report.search_report import build_search_report
 from space_dist.tracking import sync
@@ -138,7 +139,14 @@ def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(
         reported.append(grid.folder)
         (out / "report.html").write_text("a report")
 
+    drawn: list[bool] = []
+
+    def draw(ledger: Ledger, folder: Path, *, episodes: bool) -> list[Path]:  # noqa: ARG001
+        drawn.append(episodes)
+        return []
+
     monkeypatch.setattr("space_dist.report.search_report.build_search_report", build)
+    monkeypatch.setattr("space_dist.tracking.store.draw", draw)
     path, root = write_tune(tmp_path, seeds=[0], tracking={"uri": uri, "experiment": "demo"}), tmp_path / "runs"
     ids = set()
     for generations in (1, 2):
@@ -150,6 +158,8 @@ def test_mlflow_has_one_run_for_the_search_and_one_for_each_trial(
         assert {*trials} == {f"{trial.arm} {trial.number}" for trial in begun}
         assert len(runs) == len(begun)
     assert len(ids) == 1  # though the plan has grown
+    assert drawn
+    assert not any(drawn)  # drawing what every trial's policy does would take longer than training it
     assert reported == [grid.folder] * 2
     assert parent.data.params["arms"] == "round_robin, space"
     assert trials["space 3"].data.tags["setting.learner.learning_rate"]

@@ -104,9 +104,14 @@ def in_words(manifest: Manifest) -> str:
     """How far a search is: `pointmass: generation 2 of 6, 10 of 60 trials over`."""
     search = manifest.searched
     over = sum(trial.state != "open" for trial in search.trials)
-    generations = -(-int(search.config["trials"]) // int(search.config["generation"]))
     open_now = search.open
-    racing = f", {len(open_now)} open with {open_now[0].seeds} seeds each" if open_now else ""
+    racing = ""
+    if open_now:
+        upto = f" up to {open_now[0].steps:,} steps" if open_now[0].steps else ""
+        racing = f", {len(open_now)} open with {open_now[0].seeds} seeds each{upto}"
+    if search.config["population"] is not None:
+        return f"{manifest.name}: {len(search.trials)} members so far, {over} over{racing}"
+    generations = -(-int(search.config["trials"]) // int(search.config["generation"]))
     return (
         f"{manifest.name}: generation {search.generation + 1} of {generations}, {over} of {search.total} trials over"
         f"{racing}"

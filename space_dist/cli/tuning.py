@@ -213,19 +213,29 @@ def _search_of(place: Grid, manifest: Manifest) -> Search:
 def _summary(manifest: Manifest, search: Search) -> str:
     counts = Counter(trial.state for trial in search.trials)
     parts = [f"{count} {state}" for state, count in sorted(counts.items())]
-    return f"{manifest.name}: {len(search.trials)} of {search.total} trials asked: {', '.join(parts)}"
+    return f"{manifest.name}: {search.asked} of {search.total} trials asked: {', '.join(parts)}"
 
 
 def _print_trials(search: Search, cells: list[str]) -> None:
     """How the trials of each arm stand, and what those of these cells are; what they reached is the report's."""
+    rows = [
+        {
+            "arm": trial.arm, "trial": str(trial.number), "from": str(trial.parent) if trial.parent >= 0 else "",
+            "state": trial.state, "seeds": str(trial.seeds), "steps": f"{trial.steps:,}" if trial.steps else "",
+            "setting": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in trial.parameters.items()),
+        }
+        for trial in search.trials if trial.cell in cells
+    ]  # fmt: skip
+    # Of whom it is a copy, and where its runs are paused, is told where there is any such trial.
+    told = [key for key in (rows[0] if rows else ()) if any(row[key] for row in rows)]
     table = Table(title_justify="left")
-    for column in ("arm", "trial", "state", "seeds", "setting"):
-        table.add_column(column, justify="right" if column in ("trial", "seeds") else "left", overflow="fold")
-    for trial in search.trials:
-        if trial.cell in cells:
-            setting = " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in trial.parameters.items())
-            table.add_row(*map(Text, (trial.arm, str(trial.number), trial.state, str(trial.seeds), setting)))
-    console.print(table)
+    for column in told:
+        is_number = column in ("trial", "from", "seeds", "steps")
+        table.add_column(column, justify="right" if is_number else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(row[column]) for column in told))
+    if rows:
+        console.print(table)
 
 
 def _print_failed(search: Search) -> None:
@@ -242,8 +252,9 @@ def _numbers(search: Search) -> dict[str, Any]:
         "trials": [
             {
                 "arm": trial.arm, "trial": trial.number, "generation": trial.generation, "cell": trial.cell,
-                "state": trial.state, "seeds": trial.seeds, "parameters": dict(trial.parameters),
-                "values": {str(seeds): value for seeds, value in trial.values.items()}, "remark": trial.remark,
+                "state": trial.state, "seeds": trial.seeds, "steps": trial.steps or None, "rung": trial.rung,
+                "parent": trial.parent if trial.parent >= 0 else None, "parameters": dict(trial.parameters),
+                "values": {str(rung): value for rung, value in trial.values.items()}, "remark": trial.remark,
             }
             for trial in search.trials
         ],

@@ -56,7 +56,7 @@ from space_dist.config.reading import (
     read,
     told,
 )
-from space_dist.config.run import RunConfig
+from space_dist.config.run import CHANGEABLE, Change, RunConfig
 from space_dist.config.sections import (
     NAME,
     BudgetConfig,
@@ -74,11 +74,13 @@ from space_dist.config.sections import (
 from space_dist.config.shipped import about_shipped, located, shipped_files, with_what_it_names
 
 __all__ = [
+    "CHANGEABLE",
     "NAME",
     "NOT_IDENTITY",
     "A2CConfig",
     "AlpGmmConfig",
     "BudgetConfig",
+    "Change",
     "CheckpointConfig",
     "ContextSpaceConfig",
     "CurriculumConfig",

@@ -44,7 +44,7 @@ def schema() -> Iterator[tuple[str, str, str, str]]:
 
 def _describe(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str, str, str]]:
     for name, field in model.model_fields.items():
-        key, inner = f"{prefix}{_key(name, field)}", _models(field)
+        key, inner = f"{prefix}{_key(name, field)}", _models(field) or _items(field)
         if not inner:
             default = "required" if field.is_required() else json.dumps(field.get_default(), default=str)
             yield key, _type_name(field), default, " ".join((field.description or "").split())
@@ -117,7 +117,8 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
     path: list[str] = []
     model: type[BaseModel] | None = root
     options: list[type[BaseModel]] = []
-    named: type[BaseModel] | None = None  # what each of a user's own names stands for, where the next part is one
+    # What each item of a list, or of a user's own names, stands for, where the next part is one.
+    named: type[BaseModel] | None = None
     for part in location:
         if named is not None:
             path.append(str(part))
@@ -135,8 +136,14 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
         if field is not None and part != location[-1]:
             model = inner[0] if len(inner) == 1 else None
             options = inner if len(inner) > 1 else []
-            named = _by_name(field)
+            named = next(iter(_items(field)), None) or _by_name(field)
     return path, model
+
+
+def _items(field: Any) -> list[type[BaseModel]]:
+    """The section that each item of a list is, in a field that is such a list."""
+    of = get_args(field.annotation)[:1] if get_origin(field.annotation) is tuple else ()
+    return [one for one in of if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
 def _by_name(field: Any) -> type[BaseModel] | None:

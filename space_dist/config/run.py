@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from space_dist.config.curriculum import CurriculumConfig
 from space_dist.config.learner import LearnerConfig, PPOConfig
@@ -21,6 +21,35 @@ from space_dist.config.sections import (
     Section,
     TrackingConfig,
 )
+from space_dist.errors import nearest
+
+CHANGEABLE: Final = (
+    "learner.learning_rate", "learner.gamma", "learner.gae_lambda", "learner.batch_size", "learner.n_epochs",
+    "learner.clip_range", "learner.ent_coef", "learner.vf_coef", "learner.max_grad_norm", "learner.target_kl",
+    "curriculum.eta", "curriculum.kappa",
+)  # fmt: skip
+"""What may change on the way: numbers that no array of a checkpoint has its shape by."""
+
+
+class Change(Section):
+    """Settings that change on the way: a list, by steps, ascending; such as population-based training finds."""
+
+    steps: int = Field(ge=1)
+    """They are in force from the first update at or behind so many environment steps."""
+    set: dict[str, Any]
+    """Config keys and values: numbers of the learner's and of SPaCE's that decide no shape."""
+
+    @field_validator("set")
+    @classmethod
+    def _changeable(cls, given: dict[str, Any]) -> dict[str, Any]:
+        if not given:
+            raise ValueError(f"changes nothing. Allowed: {', '.join(CHANGEABLE)}")
+        for key in given:
+            if key not in CHANGEABLE:
+                raise ValueError(
+                    f"{key} cannot change on the way{nearest(key, CHANGEABLE)} Allowed: {', '.join(CHANGEABLE)}"
+                )
+        return given
 
 
 class RunConfig(Section):
@@ -51,6 +80,8 @@ class RunConfig(Section):
     learner: LearnerConfig
     rollout: RolloutConfig = Field(default=RolloutConfig(), validate_default=True)  # behind learner, which it must fit
     budget: BudgetConfig
+    schedule: tuple[Change, ...] = Field(default=(), max_length=1000, strict=False)
+    """Settings that change on the way."""
     evaluation: EvaluationConfig = EvaluationConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     tracking: TrackingConfig = TrackingConfig()
@@ -155,6 +186,40 @@ class RunConfig(Section):
             f"Use rollout: auto ({fitting.shards} and {fitting.slots} here), or learner.n_steps: "
             f"{' or '.join(multiples)}"
         )
+
+    @model_validator(mode="after")
+    def _schedule_is_possible(self) -> Self:
+        steps = [change.steps for change in self.schedule]
+        if steps != sorted({*steps}) or (steps and steps[-1] >= self.budget.steps):
+            raise ValueError(f"schedule: steps must ascend, and stay below budget.steps = {self.budget.steps}: {steps}")
+        if any("curriculum.eta" in change.set for change in self.schedule) and (
+            getattr(self.curriculum, "adaptive_eta", "off") == "persistent"
+        ):
+            raise ValueError("schedule: curriculum.eta says nothing once adaptive_eta: persistent has raised it")
+        for place, change in enumerate(self.schedule):
+            try:
+                self.at(change.steps)
+            except ValidationError as error:
+                fault = error.errors(include_url=False)[0]
+                where = ".".join(str(part) for part in fault["loc"] if part not in (self.learner.kind,))
+                raise ValueError(f"schedule.{place}: {where}: {fault['msg']}") from None
+        return self
+
+    def at(self, steps: int) -> RunConfig:
+        """The config in force from the first update at or behind so many steps on: one without a schedule."""
+        if not self.schedule:
+            return self
+        data = self.model_dump(exclude={"schedule"})
+        for change in self.schedule:
+            if change.steps <= steps:
+                for key, value in change.set.items():
+                    section, _, name = key.partition(".")
+                    data[section] = {**data[section], name: value}
+        return RunConfig.model_validate(data)
+
+    def change_after(self, steps: int) -> int:
+        """The steps of the next change behind so many; 0: there is none."""
+        return next((change.steps for change in self.schedule if change.steps > steps), 0)
 
     @property
     def n_policies(self) -> int:

@@ -270,7 +270,8 @@ class Cell:
     config: a resolved run config as plain data, its instance paths relative to the grid's folder.
     stack: equal for cells whose runs can share a process (`engine: population`); empty for runs that work alone.
     shared_mb: about what each of its runs takes of that process's memory, in MB. n_seeds: how many of the grid's seeds,
-    from the first, it runs with; 0: all. A search gives more of them to what promises more.
+    from the first, it runs with; 0: all. pause_at: environment steps at which its runs are paused for now; 0: at their
+    end. A search gives more of both to what promises more.
     """
 
     id: str
@@ -280,11 +281,17 @@ class Cell:
     stack: str = ""
     shared_mb: int = 0
     n_seeds: int = 0
+    pause_at: int = 0
 
     @property
     def budget_steps(self) -> int:
-        """Environment steps that each of its runs may take."""
+        """Environment steps that each of its runs may take in all."""
         return int(self.config["budget"]["steps"])
+
+    @property
+    def steps_to_take(self) -> int:
+        """Environment steps that each of its runs is to take for now."""
+        return self.pause_at or self.budget_steps
 
 
 @dataclass(frozen=True)
@@ -386,7 +393,8 @@ class Manifest:
             "format": FORMAT, "name": self.name, "axes": list(self.axes),
             "cells": [{"id": cell.id, "label": cell.label, "settings": cell.settings, "config": cell.config,
                        **({"stack": cell.stack, "shared_mb": cell.shared_mb} if cell.stack else {}),
-                       **({"n_seeds": cell.n_seeds} if cell.n_seeds else {})}
+                       **({"n_seeds": cell.n_seeds} if cell.n_seeds else {}),
+                       **({"pause_at": cell.pause_at} if cell.pause_at else {})}
                       for cell in self.cells],
             "seeds": list(self.seeds),
             "resources": self.resources.model_dump(), "retry": self.retry.model_dump(),

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Any, Final
 
+import numpy as np
 import optuna
 from optuna.distributions import (
     BaseDistribution,
@@ -28,7 +29,7 @@ from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from space_dist.experiment.search import Search, Trial
-from space_dist.experiment.tuning import Distribution, Pruner, Sampler, allowed
+from space_dist.experiment.tuning import Distribution, Population, Pruner, Sampler, allowed
 from space_dist.seeding import Purpose, seed_sequence
 
 DIGITS: Final = 6  # of a real number that is drawn: what a label shows is what was tried
@@ -67,11 +68,48 @@ def _needed(space: Mapping[str, Distribution], key: str) -> dict[str, Any]:
     return found
 
 
+def ranked_at_rung(search: Search, trials: Sequence[Trial]) -> list[Trial]:
+    """Trials with a value at their rung, the best first, of equal ones that which was asked first."""
+    sign = -1.0 if search.maximizes else 1.0
+    return sorted(trials, key=lambda trial: (sign * trial.values[trial.rung], trial.number))
+
+
+def explored(
+    search: Search, arm: str, rung: int, best: Sequence[Trial], count: int, population: Population
+) -> list[tuple[Trial, dict[str, Any]]]:  # fmt: skip
+    """What becomes of `count` members at a rung: one of the best, each as likely, and a setting near its own.
+
+    Each setting is drawn anew, with the chance `resample`, or multiplied by one of the factors, each as likely, and
+    kept within its range. Source: Jaderberg et al. 2017, truncation selection and perturbation.
+    """
+    space = _space(search, arm)
+    seed = _sampler_seed(int(search.config["seed"]), arm, rung)
+    random = np.random.default_rng(seed)
+    with _quietly():
+        study = optuna.create_study(sampler=RandomSampler(seed=seed))
+        found = []
+        for _ in range(count):
+            parent = best[int(random.integers(len(best)))]
+            anew = _drawn(study.ask(), space)
+            setting = {key: anew[key] if random.random() < population.resample
+                       else _perturbed(one, parent.parameters[key], random.choice(population.factors))
+                       for key, one in space.items()}  # fmt: skip
+            found.append((parent, setting))
+        return found
+
+
+def _perturbed(one: Distribution, value: Any, factor: float) -> Any:
+    if one.choice is not None:
+        return value
+    if one.ints is not None:
+        return min(max(round(float(value * factor)), one.ints[0]), one.ints[1])
+    return _outer(one, value * factor)
+
+
 def given_up(search: Search, arm: str, trials: Sequence[Trial], pruner: Pruner) -> set[int]:
-    """The numbers of those that get no more seeds; `trials` are the open ones of an arm, with a value at their rung."""
+    """The numbers of those that go no further; `trials` are the open ones of an arm, with a value at their rung."""
     if pruner.kind == "halving":
-        sign = -1.0 if search.maximizes else 1.0
-        ranked = sorted(trials, key=lambda trial: (sign * trial.values[trial.seeds], trial.number))
+        ranked = ranked_at_rung(search, trials)
         # Rounded up, but for what is rounding: a third of three is one.
         return {trial.number for trial in ranked[math.ceil(pruner.keep * len(ranked) - 1e-9) :]}
     median: BasePruner = MedianPruner(n_startup_trials=pruner.startup)
@@ -83,11 +121,12 @@ def given_up(search: Search, arm: str, trials: Sequence[Trial], pruner: Pruner) 
 def importance(search: Search, arm: str) -> dict[str, float]:
     """How much of the objective's variance each searched key explains, alone and with others (fANOVA), the most first.
 
-    Of keys that every complete trial of the arm has; their sum is 1. Empty below twenty complete trials, and where all
-    reached the same. Source: Hutter et al. 2014, as Optuna computes it, with the search's seed.
+    Of keys that every complete trial of the arm has; their sum is 1. Empty below twenty complete trials, where all
+    reached the same, and of populations, whose members had several settings. Source: Hutter et al. 2014, as Optuna
+    computes it, with the search's seed.
     """
     values = [trial.value for trial in search.of_arm(arm) if trial.value is not None]
-    if len(values) < FEWEST_WEIGHED or len({*values}) < 2:
+    if len(values) < FEWEST_WEIGHED or len({*values}) < 2 or search.config["population"] is not None:
         return {}
     with _quietly():
         study = _study(search, arm, RandomSampler(seed=0))

@@ -20,11 +20,14 @@ _STATES: tuple[TrialState, ...] = get_args(TrialState)
 class Trial:
     """One setting of an arm, tried with the search's seeds.
 
-    number: within its arm, from 0. generation: with which it was asked, from 0. parameters: value by config key, in the
-    order in which they were drawn; without those whose condition did not hold. cell: the id of its cell; empty where
-    the setting was refused, and nothing can run. seeds: how many of the search's seeds, from the first, it is given.
-    values: the objective over the first `n` seeds, by n, where that was looked at; the last one of a complete trial is
-    what it reached. remark: why it failed.
+    number: within its arm, from 0. generation: with which it was asked, from 0; of a population, at which comparison, 0
+    the start. parameters: value by config key, in the order in which they were drawn; without those whose condition did
+    not hold. cell: the id of its cell; empty where the setting was refused, and nothing can run. rung: the number, from
+    1, of the rung that it is on its way to, or ended at; seeds, steps: how many of the search's seeds, from the first,
+    and environment steps of each it is given for that; 0 steps: the whole budget. values: the objective at each rung
+    that it has come to, by the rung's number; the last one of a complete trial is what it reached. parent: the number
+    of the trial of its arm from whose state it goes on, under other settings; -1: it began on its own. inherited:
+    environment steps, of all its seeds together, that are its parent's. remark: why it failed.
     """
 
     number: int
@@ -33,13 +36,17 @@ class Trial:
     parameters: Mapping[str, Any]
     cell: str
     seeds: int
+    steps: int = 0
+    rung: int = 1
+    parent: int = -1
+    inherited: int = 0
     state: TrialState = "open"
     values: Mapping[int, float] = dataclasses.field(default_factory=dict)
     remark: str = ""
 
     @property
     def value(self) -> float | None:
-        """The objective of a complete trial, over all seeds; None for any other."""
+        """The objective of a complete trial, over all seeds and steps; None for any other."""
         return self.values[max(self.values)] if self.state == "complete" else None
 
     def to_json(self) -> dict[str, Any]:
@@ -47,13 +54,14 @@ class Trial:
         return {
             "number": self.number, "arm": self.arm, "generation": self.generation,
             "parameters": [list(pair) for pair in self.parameters.items()], "cell": self.cell, "seeds": self.seeds,
+            "steps": self.steps, "rung": self.rung, "parent": self.parent, "inherited": self.inherited,
             "state": self.state, "values": [list(pair) for pair in self.values.items()], "remark": self.remark,
         }  # fmt: skip
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Trial:
         """The inverse of `to_json`. Raises ValueError, TypeError or KeyError for anything else."""
-        values = {int(seeds): float(value) for seeds, value in data["values"]}
+        values = {int(rung): float(value) for rung, value in data["values"]}
         trial = cls(**{**data, "parameters": dict(data["parameters"]), "values": values})
         if trial.state not in _STATES or (trial.state == "complete") > bool(values):
             raise ValueError("a trial that is none")
@@ -95,7 +103,7 @@ class Search:
 
     @property
     def total(self) -> int:
-        """Trials of all arms together, asked or not."""
+        """Trials of all arms together, asked or not; of populations, those that have no parent."""
         return int(self.config["trials"]) * len(self.arms)
 
     @property
@@ -111,11 +119,24 @@ class Search:
     @property
     def over(self) -> bool:
         """Whether every trial was asked, and its outcome is known."""
-        return len(self.trials) == self.total and not self.open
+        return self.asked == self.total and not self.open
+
+    @property
+    def asked(self) -> int:
+        """Trials of all arms together that were asked; of populations, those that have no parent."""
+        return sum(trial.parent < 0 for trial in self.trials)
 
     def of_arm(self, arm: str) -> tuple[Trial, ...]:
         """The trials of an arm, by number."""
         return tuple(trial for trial in self.trials if trial.arm == arm)
+
+    def lineage(self, trial: Trial) -> tuple[Trial, ...]:
+        """The trials whose settings it has had one after the other, itself the last."""
+        of_arm = self.of_arm(trial.arm)
+        found = [trial]
+        while found[0].parent >= 0:
+            found.insert(0, of_arm[found[0].parent])
+        return tuple(found)
 
     def best(self, arm: str) -> Trial | None:
         """The complete trial of an arm with the best objective, the first of equal ones; None: there is none."""
@@ -144,7 +165,7 @@ class Search:
         search = cls(**{**data, "arms": arms, "trials": tuple(map(Trial.from_json, data["trials"]))})
         counted = dict.fromkeys(arms, 0)
         for trial in search.trials:
-            if trial.number != counted[trial.arm]:
+            if trial.number != counted[trial.arm] or not -1 <= trial.parent < trial.number:
                 raise ValueError("trials that are not in their order")
             counted[trial.arm] += 1
         return search

@@ -180,14 +180,14 @@ class RunStatus:
 def run_status_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> RunStatus:
     """Where a run stands now. `code` is this package's digest. A damaged ledger is a failed run that says so."""
     history = Attempts(ledger).history()
-    budget = run.cell.budget_steps
+    budget = run.cell.steps_to_take
     try:
         status = ledger.status() if ledger.status_file.exists() else None
     except LedgerError as error:
         damaged = why_ended(Evidence(damage=str(error)))
         return RunStatus(run, ledger, "failed", 0, budget, history.begun, damaged.cause, damaged.detail)
     steps = status.steps if status is not None else 0
-    if status is not None and status.state == "done":
+    if status is not None and status.has_reached(run.cell.pause_at):
         return RunStatus(
             run, ledger, "done", steps, budget, history.begun,
             other_code=status.fingerprint.get("code") != code, fingerprint_changed=status.fingerprint_changed,
@@ -206,14 +206,14 @@ def run_status_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> RunStatu
     return RunStatus(run, ledger, condition, steps, budget, history.begun, last.cause, last.detail)
 
 
-def is_done(ledger: Ledger) -> bool:
-    """Whether a run has ended well."""
+def is_done(run: Run, ledger: Ledger) -> bool:
+    """Whether a run has ended well, or has got as far as it is to get for now."""
     with contextlib.suppress(LedgerError):
-        return ledger.status_file.exists() and ledger.status().state == "done"
+        return ledger.status_file.exists() and ledger.status().has_reached(run.cell.pause_at)
     return False
 
 
-def concluded(ledger: Ledger, attempt: int) -> Ended | None:
+def concluded(run: Run, ledger: Ledger, attempt: int) -> Ended | None:
     """How an attempt ended whose supervisor is gone: as it wrote, or well, if its run is done; None if it was lost.
 
     The end of a done run whose supervisor was killed before it could write it is written here, once.
@@ -223,16 +223,16 @@ def concluded(ledger: Ledger, attempt: int) -> Ended | None:
     begun = history.begun >= attempt
     if begun and history.last is not None:
         return history.last
-    if not is_done(ledger):
+    if not is_done(run, ledger):
         return None
     if begun:
         attempts.end(attempt, Ended(None))
     return Ended(None)
 
 
-def settled(ledger: Ledger, attempt: int, seen: Evidence) -> Ended:
+def settled(run: Run, ledger: Ledger, attempt: int, seen: Evidence) -> Ended:
     """How an attempt ended that is over: as `concluded` knows; else by what was seen of it, which is then written."""
-    if (known := concluded(ledger, attempt)) is not None:
+    if (known := concluded(run, ledger, attempt)) is not None:
         return known
     ended = why_ended(seen)
     if not isinstance(ended, Busy):

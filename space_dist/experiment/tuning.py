@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
 from space_dist.config import NAME, Section
@@ -151,19 +152,66 @@ class Sampler(Section):
     """Of tpe: draw settings jointly and not one by one. Source: Optuna's default before its version 5."""
 
 
+class Rung(Section):
+    """How far trials have got when they are compared."""
+
+    seeds: int = Field(default=0, ge=0)
+    """Runs of so many seeds, from the first; 0: of all."""
+    steps: int = Field(default=0, ge=0)
+    """So many environment steps of each, as many as an evaluation is made at; 0: the whole budget."""
+
+    def precedes(self, other: Rung) -> bool:
+        """Whether it asks for less than another one, and for more of nothing."""
+        ours, theirs = ((one.seeds or math.inf, one.steps or math.inf) for one in (self, other))
+        return ours != theirs and ours[0] <= theirs[0] and ours[1] <= theirs[1]
+
+    def __str__(self) -> str:
+        seeds = "all seeds" if not self.seeds else "1 seed" if self.seeds == 1 else f"{self.seeds} seeds"
+        return f"{seeds}, {f'{self.steps:,}' if self.steps else 'all'} steps"
+
+
+WHOLE: Final = Rung()  # all seeds, the whole budget
+
+
 class Pruner(Section):
-    """Racing: which trials get no more seeds. Whoever is left gets the seeds up to the next rung, in the end all."""
+    """Racing: which trials are given up. Whoever is left goes on to the next rung, in the end to all of both."""
 
     kind: Literal["halving", "median"] = "halving"
     """halving: at each rung the best share of an arm's generation goes on (successive halving; Optuna's own depends on
     who ends first). median: Optuna's: whoever is below the median, at this rung, of the arm's complete trials does not
     go on."""
-    rungs: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(1,), strict=False, min_length=1)
-    """Seeds after which trials are compared, ascending, each fewer than `seeds`."""
+    rungs: tuple[Rung, ...] = Field(default=(Rung(seeds=1),), strict=False, min_length=1, max_length=100)
+    """Where trials are compared, ascending: after so many seeds, fewer than `seeds`; or after so many seeds and so many
+    steps of each, like {seeds: 1, steps: 40960}. Runs that are paused at a rung go on from there."""
     keep: float = Field(default=1 / 3, gt=0.0, lt=1.0)
     """Of halving: the share that goes on, rounded up. Source: a third is Hyperband's (Li et al. 2018)."""
     startup: int = Field(default=5, ge=1)
     """Of median: so many trials of an arm are complete before any is given up. Source: Optuna's default."""
+
+    @field_validator("rungs", mode="before")
+    @classmethod
+    def _seeds_alone(cls, value: Any) -> Any:
+        given = list(value) if isinstance(value, list | tuple) else value
+        return [{"seeds": one} if type(one) is int else one for one in given] if isinstance(given, list) else given
+
+
+class Population(Section):
+    """Population-based training: every so often the worst members of an arm go on with the state of its best ones, and
+    with other settings. Source: Jaderberg et al. 2017.
+
+    An arm's `trials` are its members at the start. Each copy is another trial, which has its parent's settings up to
+    where it was copied: so what is found is a schedule of settings, and any run of it, from its start, has the bits of
+    the one that was copied.
+    """
+
+    every_steps: int = Field(ge=1)
+    """Environment steps between two comparisons: a multiple of those between evaluations."""
+    replace: float = Field(default=0.2, gt=0.0, le=0.5)
+    """The share of the worst that goes on from the same share of the best, rounded up. Source: Jaderberg et al."""
+    factors: tuple[Annotated[float, Field(gt=0.0)], ...] = Field(default=(0.8, 1.2), strict=False, min_length=1)
+    """A copied number is multiplied by one of them, and kept within its range. Source: Jaderberg et al. 2017."""
+    resample: float = Field(default=0.25, ge=0.0, le=1.0)
+    """The chance that a setting is drawn anew instead; a choice is so, or stays. Source: Ray Tune's."""
 
 
 class FinalInstances(Section):
@@ -209,7 +257,9 @@ class TuneConfig(Section):
     objective: Objective = Objective()
     sampler: Sampler = Sampler()
     pruner: Pruner | None = None
-    """Racing over seeds; null: every trial gets all seeds."""
+    """Racing over seeds and steps; null: every trial gets all."""
+    population: Population | None = None
+    """Population-based training, in place of sampler, pruner and generations; null: settings stay what they were."""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
     """The one number from which the sampler's draws come."""
     confirm: Confirmation
@@ -233,13 +283,39 @@ class TuneConfig(Section):
         if len(self.arms) * self.trials * len(ours) > MAX_RUNS:
             raise ValueError(f"more than {MAX_RUNS:,} runs; a search may have that many")
         if self.pruner is not None:
-            rungs = self.pruner.rungs
-            if list(rungs) != sorted({*rungs}) or rungs[-1] >= len(ours):
-                raise ValueError(
-                    f"pruner.rungs: {list(rungs)}: numbers of seeds, ascending, each fewer than the {len(ours)} of a "
-                    "trial"
-                )
+            self._refuse_rungs("; ".join(map(str, self.pruner.rungs)))
+        if self.population is not None:
+            self._refuse_other_ways()
         return self
+
+    def _refuse_rungs(self, shown: str) -> None:
+        *rungs, last = self.rungs(0)
+        many = len(self.seed_list())
+        ascending = all(one.precedes(other) for one, other in pairwise([*rungs, last]))
+        if not ascending or any(rung.seeds > many for rung in rungs):
+            raise ValueError(
+                f"pruner.rungs: {shown}: numbers of seeds, ascending, each fewer than the {many} of a trial; or seeds "
+                "and steps, of which each rung has more than the one before it, and of none of them less"
+            )
+
+    def _refuse_other_ways(self) -> None:
+        for name in ("pruner", "generation", "sampler"):
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(
+                    f"{name} says nothing with population: all members begin at once, at random, and are compared "
+                    "every population.every_steps"
+                )
+        if self.trials < 2:
+            raise ValueError("trials: a population has at least 2 members")
+        for where, searched in self._searched():
+            for key, one in searched.items():
+                if one.when:
+                    raise ValueError(f"{where}.{key}: a population's settings have no conditions (when)")
+                if key not in configs.CHANGEABLE:
+                    raise ValueError(
+                        f"{where}.{key} cannot change on the way, as a population's settings do"
+                        f"{nearest(key, configs.CHANGEABLE)} Allowed: {', '.join(configs.CHANGEABLE)}"
+                    )
 
     def _refuse_names(self) -> None:
         for arm in self.arms:
@@ -272,6 +348,25 @@ class TuneConfig(Section):
                 for other in (*searched, *self.set, *arm.set):
                     if other != key and _within(other, key):
                         raise ValueError(f"arms.{name}: {other} is a part of {key}, which is searched as a whole")
+
+    def rungs(self, budget: int) -> list[Rung]:
+        """Where trials are compared, and last what a trial that is not given up comes to. budget: steps of a run."""
+        many = len(self.seed_list())
+        if self.population is not None:
+            each = self.population.every_steps
+            return [*(Rung(steps=steps) for steps in range(each, budget, each)), WHOLE]
+        rungs = () if self.pruner is None else self.pruner.rungs
+        return [*(rung.model_copy(update={"seeds": 0 if rung.seeds == many else rung.seeds}) for rung in rungs), WHOLE]
+
+    @property
+    def asked_at_once(self) -> int:
+        """Trials of an arm that a generation has; of a population, all its members."""
+        return self.trials if self.population is not None else self.generation
+
+    def _searched(self) -> Iterator[tuple[str, dict[str, Distribution]]]:
+        yield "search", self.search
+        for name, arm in self.arms.items():
+            yield f"arms.{name}.search", arm.search
 
     def _sections(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Every section that has config keys."""

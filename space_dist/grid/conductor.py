@@ -147,7 +147,7 @@ class Conductor:
         self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
-        self._overview = Overview(len(runs), sum(run.cell.budget_steps for run in runs))
+        self._overview = Overview(len(runs), sum(run.cell.steps_to_take for run in runs))
 
     def conduct(self) -> list[RunStatus]:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
@@ -193,13 +193,13 @@ class Conductor:
             waiting.append((time.monotonic() + delay, run))
         elif run_status.condition == "failed":
             self._overview.failed += 1
-            self._overview.steps_left -= run.cell.budget_steps
+            self._overview.steps_left -= run.cell.steps_to_take
             log.warning("%s: %s: %s", run.title, run_status.in_words, run_status.detail)
         elif not run_status.end_recorded and run_status.supervised:
             self._elsewhere[run.key] = run
         else:
             if not run_status.end_recorded:  # its supervisor died in between
-                concluded(run_status.ledger, run_status.attempts)
+                concluded(run, run_status.ledger, run_status.attempts)
             self._note_done(run)
 
     def _end_if_abandoned(self, run: Run) -> None:
@@ -272,7 +272,7 @@ class Conductor:
 
     def _note_done(self, run: Run) -> None:
         self._overview.done += 1
-        self._overview.steps_left -= run.cell.budget_steps
+        self._overview.steps_left -= run.cell.steps_to_take
 
     def _has_got_on(self, run: Run) -> bool:
         """Whether its last attempt has committed anything: then it is not the run that makes its attempts fail."""

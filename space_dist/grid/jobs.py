@@ -151,7 +151,7 @@ def _as_jobs(grid: Grid, manifest: Manifest, runs: Sequence[Run], mode: Mode) ->
             if status.state == "done" and status.updated_at > status.started_at:
                 rates.append(status.steps / (status.updated_at - status.started_at))
     rate = sorted(rates)[len(rates) // 2] if rates else STEPS_PER_SECOND
-    return max(cell.budget_steps for cell in manifest.cells) / rate > LONG_SECONDS
+    return max(cell.steps_to_take for cell in manifest.cells) / rate > LONG_SECONDS
 
 
 class Jobs:
@@ -263,7 +263,7 @@ class Jobs:
         seen = Evidence(job="") if details is None else Evidence(
             job=details.message or "", job_succeeded=details.status == JobStatus.SUCCEEDED
         )  # fmt: skip
-        ended = settled(self._grid.ledger(run), attempt, seen)
+        ended = settled(run, self._grid.ledger(run), attempt, seen)
         return None if isinstance(ended, Busy) else ended
 
     def _end_if_silent(self, job: str, run: Run, attempt: int) -> None:

@@ -138,7 +138,7 @@ class Supervisor:
         found: dict[str, Ended] = {}
         for run in runs:
             said = child.said.get(run.key)
-            done = said is not None and said.code == 0 and is_done(grid.ledger(run))  # an exit code proves nothing
+            done = said is not None and said.code == 0 and is_done(run, grid.ledger(run))  # an exit code proves nothing
             found[run.key] = why_ended(dataclasses.replace(seen, said=said, done=done))
         return found
 
@@ -376,11 +376,13 @@ def _work(grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str, tel
         except SpaceDistError as error:
             ended(folder, error)
     if len(runs) > 1:
-        advance({folder: member(config, folder, stop=stop) for folder, config in configured.items()}, ended)
+        members = {folder: member(config, folder, stop=stop, pause_at=by_folder[folder].cell.pause_at)
+                   for folder, config in configured.items()}  # fmt: skip
+        advance(members, ended)
         return
     for folder, config in configured.items():
         try:
-            ended(folder, launch(config, folder, resume=True, stop=stop))
+            ended(folder, launch(config, folder, resume=True, stop=stop, pause_at=by_folder[folder].cell.pause_at))
         except SpaceDistError as error:
             ended(folder, error)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,15 +28,33 @@ from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError, about
 from space_dist.experiment.endings import Cause
 from space_dist.experiment.manifest import Cell, Grid, Manifest, Run
-from space_dist.experiment.sampling import completions, draw, given_up, optuna_version
+from space_dist.experiment.sampling import (
+    completions,
+    draw,
+    explored,
+    given_up,
+    optuna_version,
+    ranked_at_rung,
+)
 from space_dist.experiment.search import ArmRecord, Search, Trial
 from space_dist.experiment.status import RunStatus, run_statuses
-from space_dist.experiment.tuning import Distribution, Pruner, TuneConfig, base_of, confirmation_of, load_tune
+from space_dist.experiment.tuning import (
+    WHOLE,
+    Distribution,
+    Pruner,
+    Rung,
+    TuneConfig,
+    base_of,
+    confirmation_of,
+    load_tune,
+)
 from space_dist.grid.conductor import freeze
+from space_dist.grid.heirs import take_over
 from space_dist.grid.planning import InstanceFiles, frozen_cell, resolved_cell
 from space_dist.instances import InstanceSet, refuse_overlap, repeats
 from space_dist.report.objective import objective_of
 from space_dist.run.building import Blueprint
+from space_dist.run.training import next_evaluation
 from space_dist.system.files import atomic_write, in_words
 from space_dist.system.provenance import code_digest, git_state
 from space_dist.tracking.settling import settled
@@ -115,6 +134,10 @@ def _continued(grid: Grid, begun: Manifest, planned: Search) -> Manifest:
     if not changes:
         return begun
     trials, each = int(search.config["trials"]), int(search.config["generation"])
+    if "trials" in changes and search.config["population"] is not None:
+        raise ConfigError(
+            f"trials: {grid.folder} was begun with a population of {trials}, which cannot change its size"
+        )
     if int(planned.config["trials"]) < trials:
         raise ConfigError(f"trials: {grid.folder} was begun with {trials}; a search may get more trials, and not fewer")
     if "trials" in changes and trials % each and len(search.trials) == search.total:
@@ -173,6 +196,9 @@ class _Planned:
                     "chooses them on the other: it needs evaluation.episodes of 2 or more"
                 )
             cell, steps = frozen_cell(self.config.resources, config, {}, name, "", self._files, self._specs)
+            self._refuse_rungs(config)
+            if self.config.population is not None and config.schedule:
+                raise ConfigError("schedule: a population finds one; its runs cannot have one to begin with")
             self._final = self._final_sets(config)
         with about("confirm.set"):
             resolved_cell(self.config.name, name, _with(_with(data, setting), self.config.confirm.set), "confirm.set")
@@ -221,6 +247,20 @@ class _Planned:
                 if key not in arms[name].space:
                     raise ConfigError(f"arms.{name}.search.{key} is never drawn: its condition (when) cannot hold")
 
+    def _refuse_rungs(self, config: RunConfig) -> None:
+        """Raise ConfigError where trials could not be compared: no evaluation is made at a rung, or none is within."""
+        key = "pruner.rungs" if self.config.population is None else "population.every_steps"
+        every, budget = config.evaluation.every_steps, config.budget.steps
+        *rungs, _ = self.config.rungs(budget)
+        for rung in rungs:
+            if rung.steps >= budget or (rung.steps and next_evaluation(every, rung.steps - 1) != rung.steps):
+                raise ConfigError(
+                    f"{key}: trials cannot be compared at {rung.steps:,} steps: these must be fewer than budget.steps "
+                    f"= {budget:,}, and steps of an evaluation (evaluation.every_steps: {every})"
+                )
+        if self.config.population is not None and not rungs:
+            raise ConfigError(f"{key} must be less than budget.steps = {budget:,}, or nobody is ever copied")
+
     def _final_sets(self, config: RunConfig) -> dict[str, str]:
         """The instance files of the confirmation. Raises ConfigError where it would not be held out from the search."""
         named = {split: str(configs.beside(path, self._folder))
@@ -266,49 +306,69 @@ def _asked(manifest: Manifest, grid: Grid) -> Manifest:
     """The manifest with the next generation of every arm. Settings that no config can have are failed trials."""
     search = manifest.searched
     config = TuneConfig.model_validate(search.config)
-    rungs = config.pruner.rungs if config.pruner is not None else ()
-    first = rungs[0] if rungs else len(manifest.seeds)
+    seeds, steps = _given(manifest, _rungs(search)[0])
     cells = {cell.id: cell for cell in manifest.cells}
     files, specs = InstanceFiles(), dict[str, EnvironmentSpec]()
     trials: list[Trial] = []
     generation = search.generation + 1
     for arm in search.arms:
         known = search.of_arm(arm)
-        for setting in draw(search, arm, min(config.generation, config.trials - len(known))):
+        for setting in draw(search, arm, min(config.asked_at_once, config.trials - len(known))):
             number = len(known) + sum(trial.arm == arm for trial in trials)
             where = f"{manifest.name}, trial {number} of {arm}"
             try:
-                cell = _cell(manifest, search, arm, number, setting, where, grid, files, specs)
+                cell = _cell(manifest, search, arm, number, setting, (), where, grid, files, specs)
             except ConfigError as error:
                 remark = str(error).removeprefix(f"{where}: ").splitlines()[0]
-                trials.append(Trial(number, arm, generation, setting, "", first, "failed", remark=remark))
+                trials.append(Trial(number, arm, generation, setting, "", seeds, steps, state="failed", remark=remark))
                 continue
             cells.setdefault(cell.id, cell)  # the same setting once more has the same runs
-            trials.append(Trial(number, arm, generation, setting, cell.id, first))
+            trials.append(Trial(number, arm, generation, setting, cell.id, seeds, steps))
     return _with_search(manifest, tuple(cells.values()), search.with_trials([*search.trials, *trials]))
 
 
+def _rungs(search: Search) -> list[Rung]:
+    """Where its trials are compared, and last what a complete one comes to."""
+    budget = next(iter(search.arms.values())).base["budget"]["steps"]  # the same for all arms
+    return TuneConfig.model_validate(search.config).rungs(int(budget))
+
+
+def _given(manifest: Manifest, rung: Rung) -> tuple[int, int]:
+    """How many seeds a trial gets for a rung, and steps of each."""
+    return rung.seeds or len(manifest.seeds), rung.steps
+
+
 def _cell(
-    manifest: Manifest, search: Search, arm: str, number: int, setting: dict[str, Any], where: str, grid: Grid,
-    files: InstanceFiles, specs: dict[str, EnvironmentSpec],
+    manifest: Manifest, search: Search, arm: str, number: int, setting: Mapping[str, Any],
+    schedule: Sequence[Mapping[str, Any]], where: str, grid: Grid, files: InstanceFiles,
+    specs: dict[str, EnvironmentSpec],
 ) -> Cell:  # fmt: skip
     data = _with(search.arms[arm].base, setting)
+    if schedule:
+        data["schedule"] = [*schedule]
     configs.from_its_folder(data, grid.folder)
     label = f"{arm} {number}"
     resolved = resolved_cell(manifest.name, label, data, where)
-    point = {"arm": arm, "trial": number, **setting}
+    point = {"arm": arm, "trial": number, **setting, **(schedule[-1]["set"] if schedule else {})}
     cell, _ = frozen_cell(manifest.resources, resolved, point, label, where, files, specs)
     return cell
 
 
 def _with_search(manifest: Manifest, cells: Iterable[Cell], search: Search) -> Manifest:
-    """The manifest with these trials: each cell with as many seeds as the trials that have it were given."""
-    given = {cell.id: 0 for cell in cells}
+    """The manifest with these trials: each cell with as many seeds and steps as the trials that have it were given."""
+    seeds, steps = {cell.id: 0 for cell in cells}, {cell.id: 0.0 for cell in cells}
     for trial in search.trials:
         if trial.cell:
-            given[trial.cell] = max(given[trial.cell], trial.seeds)
+            seeds[trial.cell] = max(seeds[trial.cell], trial.seeds)
+            steps[trial.cell] = max(steps[trial.cell], trial.steps or math.inf)
     whole = len(manifest.seeds)
-    kept = tuple(dataclasses.replace(cell, n_seeds=0 if given[cell.id] == whole else given[cell.id]) for cell in cells)
+    kept = tuple(
+        dataclasses.replace(
+            cell, n_seeds=0 if seeds[cell.id] == whole else seeds[cell.id],
+            pause_at=0 if math.isinf(steps[cell.id]) else int(steps[cell.id]),
+        )
+        for cell in cells
+    )  # fmt: skip
     return dataclasses.replace(manifest, cells=kept, search=search, baseline=kept[0].id if kept else "")
 
 
@@ -316,7 +376,7 @@ def _with_search(manifest: Manifest, cells: Iterable[Cell], search: Search) -> M
 
 
 def open_runs(manifest: Manifest) -> list[Run]:
-    """The runs of the trials whose outcome is not known, seed by seed."""
+    """The runs of the trials whose outcome is not known, seed by seed, each as far as its cell's `pause_at`."""
     waiting = {trial.cell for trial in manifest.search.open} if manifest.search is not None else set[str]()
     return [run for run in manifest.runs() if run.cell.id in waiting]
 
@@ -336,7 +396,7 @@ def advance(grid: Grid, manifest: Manifest) -> Manifest | None:
         return None
     _refuse_held_up(grid, found)
     if search.open:
-        manifest = _with_search(manifest, manifest.cells, _judged(grid, manifest, search, found))
+        manifest = _judged(grid, manifest, search, found)
     else:
         _refuse_other_optuna(search)
         manifest = _asked(manifest, grid)
@@ -362,30 +422,95 @@ def _refuse_other_optuna(search: Search) -> None:
         )
 
 
-def _judged(grid: Grid, manifest: Manifest, search: Search, found: Sequence[RunStatus]) -> Search:
-    """The search with what its open trials have reached over the seeds they were given; some get more of them."""
+def _judged(grid: Grid, manifest: Manifest, search: Search, found: Sequence[RunStatus]) -> Manifest:
+    """The manifest with what its open trials have reached at their rung; some are given up, the others go on.
+
+    Of a population, those that are given up have heirs of the best in their place.
+    """
     failed: dict[str, tuple[int, str]] = {}
     for one in found:
         if one.condition == "failed" and one.cause is not None:
             failed.setdefault(one.run.cell.id, (one.run.seed, one.cause.in_words))
     judged = [trial if trial.state != "open" else _measured(grid, manifest, trial, failed.get(trial.cell))
               for trial in search.trials]  # fmt: skip
-    config = search.config["pruner"]
-    pruner = None if config is None else Pruner.model_validate(config)
-    if pruner is None:
-        return search.with_trials(judged)
+    config, rungs = TuneConfig.model_validate(search.config), _rungs(search)
     gone: set[tuple[str, int]] = set()
+    chosen: list[tuple[Trial, dict[str, Any]]] = []
     for arm in search.arms:
         racing = [trial for trial in judged if trial.arm == arm and trial.state == "open"]
-        if racing:
-            gone |= {(arm, number) for number in given_up(search, arm, racing, pruner)}
-    steps = [*pruner.rungs, len(manifest.seeds)]
-    return search.with_trials(
-        [trial if trial.state != "open" else
-         dataclasses.replace(trial, state="pruned") if (trial.arm, trial.number) in gone else
-         dataclasses.replace(trial, seeds=next(seeds for seeds in steps if seeds > trial.seeds))
-         for trial in judged]
-    )  # fmt: skip
+        if not racing:
+            continue
+        if config.population is None:
+            gone |= {(arm, number) for number in given_up(search, arm, racing, _pruner(config))}
+            continue
+        rung = racing[0].rung
+        count = math.ceil(config.population.replace * config.trials - 1e-9)
+        lost = config.trials - len(racing)  # failed: heirs take their places first
+        worst = ranked_at_rung(search, racing)[max(1, len(racing) - max(0, count - lost)) :]
+        gone |= {(arm, trial.number) for trial in worst}
+        best = ranked_at_rung(search, racing)[: max(1, min(count, len(racing) - len(worst)))]
+        chosen += explored(search, arm, rung, best, len(worst) + lost, config.population)
+    after = [trial if trial.state != "open" else
+             dataclasses.replace(trial, state="pruned") if (trial.arm, trial.number) in gone else
+             _sent_on(manifest, trial, rungs)
+             for trial in judged]  # fmt: skip
+    cells, heirs = _heirs(grid, manifest, search.with_trials(after), chosen, rungs)
+    return _with_search(manifest, cells, search.with_trials([*after, *heirs]))
+
+
+def _pruner(config: TuneConfig) -> Pruner:
+    if config.pruner is None:
+        raise RuntimeError("an open trial has come to its end, and is not complete")
+    return config.pruner
+
+
+def _sent_on(manifest: Manifest, trial: Trial, rungs: Sequence[Rung]) -> Trial:
+    """On its way to the next rung."""
+    seeds, steps = _given(manifest, rungs[trial.rung])
+    return dataclasses.replace(trial, rung=trial.rung + 1, seeds=seeds, steps=steps)
+
+
+def _heirs(
+    grid: Grid, manifest: Manifest, search: Search, chosen: Sequence[tuple[Trial, dict[str, Any]]],
+    rungs: Sequence[Rung],
+) -> tuple[list[Cell], list[Trial]]:  # fmt: skip
+    """The trials that go on from others' state, each with its parent and its settings, and all cells with theirs.
+
+    Their runs are there when this returns.
+    """
+    files, specs = InstanceFiles(), dict[str, EnvironmentSpec]()
+    cells = {cell.id: cell for cell in manifest.cells}
+    heirs: list[Trial] = []
+    for parent, setting in chosen:
+        number = len(search.of_arm(parent.arm)) + sum(heir.arm == parent.arm for heir in heirs)
+        where = f"{manifest.name}, trial {number} of {parent.arm}"
+        seeds, steps = _given(manifest, rungs[parent.rung])
+        heir = Trial(
+            number, parent.arm, parent.rung, setting, "", seeds, steps, rung=parent.rung + 1, parent=parent.number
+        )
+        first, schedule = _in_force(search.with_trials([*search.trials, *heirs, heir]), heir, rungs)
+        try:
+            cell = _cell(manifest, search, parent.arm, number, first, schedule, where, grid, files, specs)
+        except ConfigError as error:
+            remark = str(error).removeprefix(f"{where}: ").splitlines()[0]
+            heirs.append(dataclasses.replace(heir, state="failed", remark=remark))
+            continue
+        inherited = take_over(grid, cells[parent.cell], cell, manifest.seeds[: parent.seeds])
+        cells.setdefault(cell.id, cell)
+        heirs.append(dataclasses.replace(heir, cell=cell.id, inherited=inherited))
+    return [*cells.values()], heirs
+
+
+def _in_force(
+    search: Search, trial: Trial, rungs: Sequence[Rung]
+) -> tuple[Mapping[str, Any], list[Mapping[str, Any]]]:  # fmt: skip
+    """The settings that a trial began with, and how they changed on the way: a config's `schedule`."""
+    first, *later = search.lineage(trial)
+    # An heir's generation is the number of the rung at which it was copied.
+    schedule: list[Mapping[str, Any]] = [
+        {"steps": rungs[heir.generation - 1].steps, "set": dict(heir.parameters)} for heir in later
+    ]
+    return first.parameters, schedule
 
 
 def _measured(grid: Grid, manifest: Manifest, trial: Trial, failed: tuple[int, str] | None) -> Trial:
@@ -396,10 +521,9 @@ def _measured(grid: Grid, manifest: Manifest, trial: Trial, failed: tuple[int, s
     value = objective_of(grid, manifest, trial)
     if not np.isfinite(value):
         return dataclasses.replace(trial, state="failed", remark="its objective is no number")
-    values = {**trial.values, trial.seeds: value}
-    return dataclasses.replace(
-        trial, state="complete" if trial.seeds == len(manifest.seeds) else "open", values=values
-    )  # fmt: skip
+    complete = (trial.seeds, trial.steps) == _given(manifest, WHOLE)
+    values = {**trial.values, trial.rung: value}
+    return dataclasses.replace(trial, state="complete" if complete else "open", values=values)
 
 
 # ---- the confirmation ------------------------------------------------------------------------------------------------
@@ -427,8 +551,10 @@ def confirmation(grid: Grid, manifest: Manifest) -> Path:
         best = search.best(arm)
         if best is None:
             raise ConfigError(f"arm {arm} has nothing to confirm: none of its {config.trials} trials is complete")
-        data = _with(record.base, best.parameters)
-        data = _with(data, config.confirm.set)
+        first, schedule = _in_force(search, best, _rungs(search))
+        data = _with(_with(record.base, first), config.confirm.set)
+        if schedule:
+            data["schedule"] = schedule
         for split, path in search.final.items():
             configs.put(data, f"instances.{split}", f"../{path}", "confirm")
         if data.get("init_from") is not None:

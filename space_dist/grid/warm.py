@@ -140,7 +140,7 @@ def understood(attempts: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any
 
 def all_lost(grid: Grid, attempts: Sequence[tuple[Run, int]], seen: Evidence) -> list[tuple[Run, Ended | None]]:
     """Those that are done are done; nobody but whoever manages them can say how the others ended."""
-    return [(run, settled(grid.ledger(run), attempt, seen)) for run, attempt in attempts]
+    return [(run, settled(run, grid.ledger(run), attempt, seen)) for run, attempt in attempts]
 
 
 def supervisor_lost(reason: str | None) -> Evidence:

@@ -19,7 +19,7 @@ from space_dist.ledger.lock import owner_alive
 from space_dist.ledger.rows import METRICS, ROW_FILES, Row, decode_row
 from space_dist.system.files import read_file
 
-State = Literal["running", "interrupted", "failed", "done"]
+State = Literal["running", "interrupted", "failed", "paused", "done"]
 _MAX_STATUS_BYTES = 1 << 20
 _CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
@@ -27,7 +27,10 @@ _READINGS = 3  # of a file and the status that names it, which a live writer may
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """`status.json`. Steps are real environment steps of training; times are seconds since the epoch."""
+    """`status.json`. Steps are real environment steps of training; times are seconds since the epoch.
+
+    paused_at: of a run that is paused, the steps at which it was asked to be; 0 for any other.
+    """
 
     state: State
     name: str
@@ -46,7 +49,12 @@ class Status:
     identity: str | None = None  # a hash of everything that decides the run's results
     fingerprint: Mapping[str, str] = dataclasses.field(default_factory=dict)
     fingerprint_changed: bool = False  # resumed where bit-equality is not promised
+    paused_at: int = 0
     format: int = FORMAT
+
+    def has_reached(self, pause_at: int) -> bool:
+        """Whether there is nothing left to do: it is done, or paused where it was asked to be (0: nowhere)."""
+        return self.state == "done" or (self.state == "paused" and 0 < pause_at <= self.paused_at)
 
     def is_final(self, evaluated_at: int) -> bool:
         """Whether an evaluation after so many steps tells a run's final numbers: of the policy it finished with."""

@@ -71,6 +71,13 @@ class RunWriter:
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
+    @property
+    def current(self) -> Status:
+        """The status as it was last written. Raises RuntimeError before there is one."""
+        if self.status is None:
+            raise RuntimeError("the run has no status yet")
+        return self.status
+
     def write_config(self, config: str, train: str, test: str, weights: bytes | None = None) -> None:
         """Record what was asked for. The config comes last: a folder that has one is complete.
 

@@ -8,7 +8,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -51,6 +51,27 @@ class Run:
     set_sizes: IntArray
     generates_contexts: bool
     all_instances_reached_at: int | None
+
+    def until(self, steps: int) -> Run:
+        """The run as if its budget had ended with the first evaluation at or behind so many steps.
+
+        It is unfinished where it was not evaluated so late. What is read anew from the ledger, but for `final_halves`,
+        is the whole run's.
+        """
+        at = int(np.searchsorted(self.evaluation_steps, steps))
+        if at == len(self.evaluation_steps):
+            return replace(self, status=replace(self.status, state="interrupted"))
+        end = int(self.evaluation_steps[at])
+        complete = self.iteration_ends <= end
+        reached = self.all_instances_reached_at
+        return replace(
+            self, status=replace(self.status, state="done", steps=end),
+            evaluation_steps=self.evaluation_steps[: at + 1],
+            train={name: column[: at + 1] for name, column in self.train.items()},
+            test={name: column[: at + 1] for name, column in self.test.items()},
+            iteration_ends=self.iteration_ends[complete], set_sizes=self.set_sizes[complete],
+            all_instances_reached_at=None if reached is None or reached > end else reached,
+        )  # fmt: skip
 
     @property
     def finished(self) -> bool:
@@ -112,6 +133,7 @@ class Run:
         Read anew. None where instances were evaluated on one episode each, or nothing was evaluated.
         """
         rows = [row for row in _rows(self.ledger, METRICS) if row.get("kind") == "evaluation"]
+        rows = rows[: len(self.evaluation_steps)]  # more may have been written since, or be cut off (`until`)
         with _readable(self.ledger):
             found = rows[-1][split].get("halves") if rows else None
             return None if found is None else np.array(found, dtype=np.float64).reshape(2, -1)

@@ -28,15 +28,17 @@ _MEASURES: Final = {"final": "final", "worst": "worst", "area": "early"}
 
 
 def objective_of(grid: Grid, manifest: Manifest, trial: Trial) -> float:
-    """The objective of a trial over the seeds it was given; NaN where a seed has no such number.
+    """The objective of a trial over the seeds and steps it was given; NaN where a seed has no such number.
 
     Raises LedgerError if a run's folder cannot be read, or belongs to another run.
     """
     assert manifest.search is not None  # noqa: S101 - it has trials
     cell = manifest.cell(trial.cell)
     runs = [load_run(grid.ledger(GridRun(cell, seed)), cell.config) for seed in manifest.seeds[: trial.seeds]]
+    if trial.steps:
+        runs = [run.until(trial.steps) for run in runs]
     objective = Objective.model_validate(manifest.search.config["objective"])
-    return over_seeds(runs, objective, cell.budget_steps)
+    return over_seeds(runs, objective, trial.steps or cell.budget_steps)
 
 
 def over_seeds(runs: Sequence[Run], objective: Objective, budget: int) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -39,7 +39,8 @@ Every arm has the same number of trials, and every trial that is not given up th
 number over its seeds. It chose the setting; it is not what the setting is worth: the greatest of many noisy numbers is
 too great, the more so the more trials there are and the fewer seeds.
 
-Complete: all seeds were run. Pruned: racing gave it up after some of them. Failed: a run of it crashed, used more
+Complete: all seeds were run, to the end. Pruned: racing gave it up before that; of a population, another one has its
+place, which went on from a better one's state under settings of its own. Failed: a run of it crashed, used more
 memory or time than it may, or its objective is no number; the sampler is told so, and the search goes on.
 
 Importance is the share of the objective's variance over an arm's complete trials that a setting explains, alone and
@@ -108,8 +109,8 @@ def _how_far(search: Search) -> str:
     counts = Counter(trial.state for trial in search.trials)
     known = ", ".join(f"{counts[state]} {state}" for state in ("complete", "pruned", "failed", "open") if counts[state])
     if search.over:
-        return f"The search is over: of {search.total} trials, {known}."
-    return f"The search is not over: {len(search.trials)} of {search.total} trials were asked: {known}."
+        return f"The search is over: of {len(search.trials)} trials, {known}."
+    return f"The search is not over: {search.asked} of {search.total} trials were asked: {known}."
 
 
 def _searched(grid: Grid, manifest: Manifest, search: Search) -> Section:
@@ -135,17 +136,24 @@ def _arms(grid: Grid, manifest: Manifest, search: Search) -> list[dict[str, str]
     for arm in search.arms:
         trials, best = search.of_arm(arm), search.best(arm)
         counts = Counter(trial.state for trial in trials)
+        heirs = sum(trial.parent >= 0 for trial in trials)
         rows.append(
             {
                 "arm": arm,
-                "trials": f"{len(trials)}/{search.config['trials']}",
+                "trials": f"{len(trials) - heirs}/{search.config['trials']}" + (f" + {heirs} heirs" if heirs else ""),
                 **{state: str(counts[state]) for state in ("complete", "pruned", "failed")},
-                "environment steps": f"{sum(steps[cell] for cell in {trial.cell for trial in trials}):,}",
+                "environment steps": f"{_steps_of(trials, steps):,}",
                 "chosen": NONE if best is None else f"trial {best.number}",
                 "setting": NONE if best is None else _setting(best),
             }
         )
     return rows
+
+
+def _steps_of(trials: Sequence[Trial], steps: Mapping[str, int]) -> int:
+    """Environment steps that these trials took: trials of one setting share their runs, and heirs their beginning."""
+    by_cell = {trial.cell: trial for trial in trials}
+    return sum(steps[cell] - trial.inherited for cell, trial in by_cell.items() if cell in steps)
 
 
 def _setting(trial: Trial) -> str:
@@ -233,7 +241,8 @@ def _trial_rows(search: Search) -> list[dict[str, Value]]:
     return [
         {
             "arm": trial.arm, "trial": trial.number, "generation": trial.generation, "state": trial.state,
-            "cell": trial.cell, "seeds": max(trial.values, default=0),
+            "cell": trial.cell, "parent": trial.parent if trial.parent >= 0 else None,
+            "seeds": trial.seeds if trial.values else 0,
             "search_objective": trial.values[max(trial.values)] if trial.values else math.nan,
             **{key: None if key not in trial.parameters else _plain(trial.parameters[key]) for key in keys},
             "remark": trial.remark,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from space_dist.config import DQNConfig, RunConfig
 from space_dist.errors import ConfigError
-from space_dist.ledger import Checkpoint
+from space_dist.ledger import Checkpoint, Status
 
 
 def is_longer(before: RunConfig, now: RunConfig) -> bool:
@@ -27,6 +27,13 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
             "use --out DIR for it. With `init_from` it starts from this run's policy"
         )
     return True
+
+
+def takes_over(before: RunConfig, now: RunConfig, status: Status | None) -> bool:
+    """Whether `now` is `before` with one more change, and the run is paused just where that comes into force."""
+    if status is None or status.state != "paused" or not now.schedule:
+        return False
+    return now.schedule[:-1] == before.schedule and status.paused_at == now.schedule[-1].steps
 
 
 def _goes_by_budget(config: RunConfig) -> str | None:

@@ -41,7 +41,7 @@ from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Cluster, InProcess, n_workers
-from space_dist.run.continuing import is_longer, within
+from space_dist.run.continuing import is_longer, takes_over, within
 from space_dist.run.starting import weights_in
 from space_dist.run.training import Progress, Training
 from space_dist.system.extras import needed_from
@@ -73,22 +73,25 @@ def launch(
     *,
     resume: bool,
     stop: StopRequests,
+    pause_at: int = 0,
     observe: Callable[[Progress], None] = lambda progress: None,
     waiting: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
     """Run `config` in `folder` to its end, or go on where it stopped.
 
-    observe: told of progress. waiting: told what is waited for, before and behind that: `starting Ray`.
+    pause_at: environment steps at which it is paused, behind the first update that is made then, to be gone on with by
+    another launch; 0: nowhere. observe: told of progress. waiting: told what is waited for, before and behind that:
+    `starting Ray`.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
     SpaceDistError after noting it in the run's status.
     """
-    with begun(config, folder, resume=resume, stop=stop) as active:
-        if not active.outcome.already_done:
-            with _cluster(active, waiting) as cluster:
+    with begun(config, folder, resume=resume, stop=stop, pause_at=pause_at) as active:
+        for part in active.parts():
+            with _cluster(part, waiting) as cluster:
                 waiting("preparing the learner")
-                active.training(cluster, observe).run()
+                part.training(cluster, observe).run()
     # The lock is free by now: a server that hangs keeps nobody from the run.
     if active.pusher is not None:
         waiting(f"mirroring to MLflow, for {_FINAL_PUSH_SECONDS:.0f} s at most")
@@ -97,7 +100,10 @@ def launch(
 
 @dataclass
 class ActiveRun:
-    """A run that is this process's own now. outcome: how it ends; `already_done` where there is nothing to do."""
+    """A run that is this process's own now.
+
+    outcome: how it ends; `already_done` where there is nothing to do. pause_at, change_at: as of `Training`.
+    """
 
     blueprint: Blueprint
     setup: Setup
@@ -106,13 +112,32 @@ class ActiveRun:
     stop: StopRequests
     outcome: Outcome
     pusher: Pusher | None = None
+    pause_at: int = 0
+    change_at: int = 0
+
+    def parts(self) -> Iterator[ActiveRun]:
+        """What is left of it: all at once, or, under a schedule, the part up to each change, under what is in force.
+
+        The next part is asked for when the one before it was trained to its end.
+        """
+        config, writer = self.blueprint.config, self.writer
+        while not self.outcome.already_done and not writer.current.has_reached(self.pause_at):
+            if not config.schedule:
+                yield self
+                return
+            checkpoint = writer.restore()
+            steps = 0 if checkpoint is None else int(checkpoint.data["run"]["steps"])
+            blueprint = replace(self.blueprint, config=config.at(steps))
+            setup = blueprint.setup(self.setup.train, self.setup.test)
+            yield replace(self, blueprint=blueprint, setup=setup, change_at=config.change_after(steps))
 
     def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
         self.raise_if_stopped()
         return Training(
             self.blueprint, self.setup, cluster, self.writer,
-            status=self.status, stop_requested=self.stop.reason, observe=observe,
+            status=self.status, pause_at=self.pause_at, change_at=self.change_at,
+            stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
 
     def mirror(self) -> None:
@@ -144,18 +169,22 @@ class ActiveRun:
 
 
 @contextlib.contextmanager
-def begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
+def begun(
+    config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests, pause_at: int = 0
+) -> Iterator[ActiveRun]:  # fmt: skip
     """Make the folder this run's, for as long as the context lasts. What is raised within is noted in its status.
 
     Raises as `launch` does.
     """
     # Environments are made and reset from here on.
-    with exits_refused(), _zero_exits_reported(), _begun(config, folder, resume=resume, stop=stop) as active:
+    with exits_refused(), _zero_exits_reported(), _begun(config, folder, resume, stop, pause_at) as active:
         yield active
 
 
 @contextlib.contextmanager
-def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests) -> Iterator[ActiveRun]:
+def _begun(
+    config: RunConfig, folder: Path, resume: bool, stop: StopRequests, pause_at: int
+) -> Iterator[ActiveRun]:  # fmt: skip
     threadpool_limits(limits=1)  # the bits of a matrix product depend on how many threads share it
     # `auto` is settled here, once: stored, it means the same server wherever the run is resumed.
     config = config.model_copy(update={"tracking": settled(config.tracking, "space_dist")})
@@ -166,8 +195,9 @@ def _begun(config: RunConfig, folder: Path, *, resume: bool, stop: StopRequests)
     if ledger.exists() and not resume:
         raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
     with RunWriter(ledger) as writer:
-        status = _claim(blueprint, setup, writer)
-        active = ActiveRun(blueprint, setup, writer, status, stop, Outcome(ledger, already_done=status.state == "done"))
+        status = _claim(blueprint, setup, writer, pause_at)
+        done = Outcome(ledger, already_done=status.has_reached(pause_at))
+        active = ActiveRun(blueprint, setup, writer, status, stop, done, pause_at=pause_at)
         if active.outcome.already_done:
             yield active
             return
@@ -196,7 +226,7 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
         raise Interrupted(message)
 
 
-def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
+def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
     config, ledger = blueprint.config, writer.ledger
     weights = None if config.init_from is None else weights_in(config.init_from)
@@ -207,9 +237,9 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
         identity=configs.identity(config, setup.train.digest(), setup.test.digest(), weights=weights),
     )  # fmt: skip
     before = writer.status = _status_before(ledger)
-    shorter = _refuse_other_run(config, setup, weights, ledger, status.identity, before)
+    earlier = _refuse_other_run(config, setup, weights, ledger, status.identity, before)
     if before is not None:
-        if before.state == "done" and shorter is None:
+        if before.has_reached(pause_at) and earlier is None:
             damage = ledger.damage()
             if not damage:
                 return before
@@ -227,13 +257,14 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter) -> Status:
             status, steps=before.steps, round=before.round, started_at=before.started_at,
             # Once marked, always marked: rows from then on are in the results.
             fingerprint_changed=before.fingerprint_changed or changed,
-            identity=before.identity if before.identity and shorter is None else status.identity,
+            identity=before.identity if before.identity and earlier is None else status.identity,
         )  # fmt: skip
     stored = configs.dump(_self_contained(config))
-    if shorter is not None:
-        now_at = writer.hand_over(status, stored, within(shorter, blueprint.spec.horizon))
+    if earlier is not None:
+        now_at = writer.hand_over(status, stored, within(earlier, blueprint.spec.horizon))
         status = replace(status, steps=now_at.steps, round=now_at.round)
-        log.info("going on under a larger budget, from round %d", status.round)
+        what = "another schedule" if earlier.budget == config.budget else "a larger budget"
+        log.info("going on under %s, from round %d", what, status.round)
     # Before the status, which names the digests of these files.
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
     # It asked the process before this one.
@@ -294,7 +325,7 @@ def _refuse_other_run(
 ) -> RunConfig | None:
     """Raise ConfigError if the folder holds a run of another configuration, with what differs where that is known.
 
-    Returns its config where it is this run with a smaller budget.
+    Returns its config where it is this run with a smaller budget, or before the last change of its schedule.
     """
     if before is not None and before.identity == identity:
         return None  # the copies of config and instances in the folder are written anew
@@ -316,6 +347,9 @@ def _refuse_other_run(
                 "when it was killed: ask for that budget again"
             )
         return None  # an earlier version's identity
+    heir = stored.model_copy(update={"schedule": config.schedule})
+    if identity == configs.identity(heir, *digests, weights=learned) and takes_over(stored, config, before):
+        return stored
     longer = stored.model_copy(update={"budget": config.budget})
     if identity == configs.identity(longer, *digests, weights=learned) and is_longer(stored, config):
         return stored

@@ -33,12 +33,12 @@ _SLOTS = 1024  # environments stepped together, at most: what the cache holds of
 _KEPT = 4  # batches of environments that are kept, beside those in which episodes go on
 
 
-def member(config: RunConfig, folder: Path, *, stop: StopRequests) -> Work[Outcome]:
-    """One run of a population, to its end or from where it stopped; raises as `launch` does."""
-    with begun(config, folder, resume=True, stop=StopRequests(stop)) as active:
-        if not active.outcome.already_done:
-            with contextlib.closing(_Promising(config, active.setup, folder)) as cluster:
-                yield from active.training(cluster).work()
+def member(config: RunConfig, folder: Path, *, stop: StopRequests, pause_at: int = 0) -> Work[Outcome]:
+    """One run of a population, to its end, or as far as asked, from where it stopped; raises as `launch` does."""
+    with begun(config, folder, resume=True, stop=StopRequests(stop), pause_at=pause_at) as active:
+        for part in active.parts():
+            with contextlib.closing(_Promising(part.blueprint.config, part.setup, folder)) as cluster:
+                yield from part.training(cluster).work()
     return active.finished()
 
 

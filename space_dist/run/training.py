@@ -130,11 +130,15 @@ class Training:
         writer: RunWriter,
         *,
         status: Status,
+        pause_at: int = 0,
+        change_at: int = 0,
         stop_requested: Callable[[], str | None] = lambda: None,
         observe: Callable[[Progress], None] = lambda progress: None,
     ) -> None:
+        """pause_at, change_at: steps at which it ends before its budget does, to be gone on with; 0: nowhere."""
         self._config, self._setup, self._cluster, self._writer = blueprint.config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
+        self._pause_at, self._change_at = pause_at, change_at
         self._horizon = setup.spec.horizon
         self._total_steps = blueprint.total_steps
         self.learner = blueprint.learner()
@@ -148,7 +152,7 @@ class Training:
         self.progress = Progress(0, self._total_steps, 0.0, 0, len(setup.train))
 
     def run(self) -> None:
-        """Train to the end of the budget. Raises Interrupted, after a commit, if asked to stop."""
+        """Train to the end of the budget, or as far as asked. Raises Interrupted, after a commit, if asked to stop."""
         work = self.work()
         answer: Any = None
         while True:
@@ -186,6 +190,8 @@ class Training:
             if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
                 self._evaluate(policy)
             self._show()
+            if (yield from self._has_paused()):
+                return
             yield from self._commit_if_due()
         yield from self._finish()
 
@@ -474,6 +480,16 @@ class Training:
         if rate is not None:
             self.progress.steps_per_second = rate
 
+    def _has_paused(self) -> Work[bool]:
+        """Commit where this part of the run ends, if it does: the next part goes on from there, as if resumed."""
+        if self._is_over():
+            return False
+        for place, state in ((self._pause_at, "paused"), (self._change_at, "running")):
+            if 0 < place <= self._run.steps:
+                yield from self._commit(state)
+                return True
+        return False
+
     def _commit_if_due(self) -> Work[None]:
         reason = self._stop_requested()
         if reason is not None:
@@ -496,7 +512,7 @@ class Training:
     def _new_status(self, state: Any, message: str | None = None) -> Status:
         return dataclasses.replace(
             self._status, state=state, message=message, steps=self._run.steps, round=self._run.round,
-            updated_at=time.time(),
+            updated_at=time.time(), paused_at=self._pause_at if state == "paused" else 0,
         )  # fmt: skip
 
     def _save(self) -> Work[Checkpoint]:

@@ -67,7 +67,7 @@ def _plan(grid: Grid, manifest: Manifest) -> list[str]:
     runs = manifest.runs()
     made_of = f"{_count(len(cells), 'cell')} × {_count(len(seeds), 'seed')}"
     if manifest.search is not None:
-        made_of = f"a search, {len(manifest.search.trials):,} of {_count(manifest.search.total, 'trial')} asked"
+        made_of = f"a search, {manifest.search.asked:,} of {_count(manifest.search.total, 'trial')} asked"
     lines = [
         f"**{_cell_text(manifest.name)}**: {made_of} = {_count(len(runs), 'run')} of {each} environment steps, "
         f"{sum(run.cell.budget_steps for run in runs):,} in all",

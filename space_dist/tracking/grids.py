@@ -262,7 +262,9 @@ class GridMirror:
         stamp = key_of(repr(sorted(tags.items())), repr(look.status), look.ending)
         return Part(
             self._run_key(grid_key, run), run.title, remark(look), self.grid.folder, f"{_place(cell)}/s{run.seed}",
-            cell.label, tags, look.ending, look.ended_at, stamp, shows_episodes=run.seed == manifest.seeds[0],
+            cell.label, tags, look.ending, look.ended_at, stamp,
+            # A search has many settings that nobody keeps: drawing them all takes longer than training them.
+            shows_episodes=run.seed == manifest.seeds[0] and manifest.search is None,
         )  # fmt: skip
 
     def _curve(self, manifest: Manifest, cell: Cell, grid_key: str) -> CellCurve:

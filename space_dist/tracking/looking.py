@@ -86,7 +86,7 @@ def signature(path: str) -> Signature:
 
 def look_at(run: Run, ledger: Ledger, manifest: Manifest, files: tuple[Signature, ...]) -> Look:
     if not any(files):
-        waiting = RunStatus(run, ledger, "waiting", 0, run.cell.budget_steps, 0)
+        waiting = RunStatus(run, ledger, "waiting", 0, run.cell.steps_to_take, 0)
         return Look(files, waiting, None, History(), 0.0, None)
     try:
         attempts = Attempts(ledger)
@@ -97,7 +97,7 @@ def look_at(run: Run, ledger: Ledger, manifest: Manifest, files: tuple[Signature
         final = final_return(ledger, status) if status is not None and run_status.condition == "done" else None
     except LedgerError as error:
         ended = why_ended(Evidence(damage=str(error)))
-        run_status = RunStatus(run, ledger, "failed", 0, run.cell.budget_steps, 0, ended.cause, ended.detail)
+        run_status = RunStatus(run, ledger, "failed", 0, run.cell.steps_to_take, 0, ended.cause, ended.detail)
         return Look(files, run_status, None, History(), 0.0, None, fault=str(error))
     # A heartbeat is no news.
     history = dataclasses.replace(history, where={k: v for k, v in history.where.items() if k != "heartbeat"})

@@ -164,7 +164,9 @@ class Snapshot:
             return self.part.ending
         if self.status.state == "running":
             return "RUNNING" if self.alive else "KILLED"
-        return {"done": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}[self.status.state]
+        return {"done": "FINISHED", "paused": "FINISHED", "failed": "FAILED", "interrupted": "KILLED"}[
+            self.status.state
+        ]
 
     @property
     def started_at(self) -> float:
