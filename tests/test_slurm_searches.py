@@ -10,10 +10,12 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from space_dist.api.tuning import run_search
 from space_dist.config import read_yaml, to_yaml
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause
@@ -25,6 +27,7 @@ from space_dist.slurm.export import ADVANCE, JOBS, NEXT, README, SUBMIT, TRAIN, 
 from space_dist.slurm.searches import digest_of_trials, reached, runs_of_task
 from tests.commanding import command
 from tests.slurm.profiles import exports
+from tests.test_racing import population_tune, racing_tune
 from tests.test_slurm import HOSTILE, MODES, Stubs, profile, short, stubs, write  # noqa: F401
 from tests.tunes import Outcome, end, search_of, search_through, write_tune
 from tests.tunes import reached as outcome_of
@@ -334,6 +337,27 @@ def test_a_search_ends_with_the_same_bytes(
     assert "generation 3 of 3" in said
     assert "12 of 12 trials asked" in said
     assert tasks_done >= 12
+
+
+@pytest.mark.parametrize("made", [racing_tune, population_tune])
+def test_trials_that_are_paused_go_on_in_later_arrays(
+    made: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trained here, each task in its turn, as jobs do it; one of each array's is lost."""
+    path = made(tmp_path, arms={"a": {}})
+    here = run_search(path, root=tmp_path / "runs", progress=False).grid
+    assert command(monkeypatch, "slurm", "export", path, "--out", tmp_path / "out") == 0
+    grid, after, arrays = Grid(tmp_path / "out"), "first", 0
+    while (code := advanced(monkeypatch, grid.folder, after)) == 3:
+        trials, after, tasks = planned_tasks(grid.folder)
+        for task in tasks if arrays % 2 or len(tasks) == 1 else tasks[1:]:
+            part = f"{2 * task}-{2 * task + 1}"
+            assert command(monkeypatch, "slurm", "task", grid.folder, "--trials", trials, "--part", part) == 0
+        arrays += 1
+        assert arrays < 20
+    assert code == 0
+    assert arrays > 3
+    assert grid.manifest_file.read_bytes() == here.manifest_file.read_bytes()
 
 
 def test_what_gets_no_further_is_not_submitted_for_ever(

@@ -101,7 +101,7 @@ def slurm_export(
     for path in export(made, instances, out, templates):
         say(str(path))
     tasks = f"{made.n_tasks} array tasks" if mode == "array" else f"one job of {site.nodes} nodes"
-    at_most = "" if manifest.search is None else "in each generation at most "
+    at_most = "" if manifest.search is None else "at most "
     say(f"{manifest.name}: {at_most}{made.n_runs} runs in {tasks}; {out / 'README.md'} says what to do with it")
     if remark := made.tracking_remark(out):
         warn(f"warning: {remark}")

@@ -93,11 +93,13 @@ class Export:
 
     @property
     def n_runs(self) -> int:
-        """All of the grid's; of a search, as many as a generation has at most."""
+        """All of the grid's; of a search, as many as are open at a time at most."""
         search = self.manifest.search
         if search is None:
             return len(self.manifest.runs())
-        trials = min(int(search.config["generation"]), int(search.config["trials"]))
+        trials = int(search.config["trials"])
+        if search.config["population"] is None:
+            trials = min(trials, int(search.config["generation"]))
         return trials * len(search.arms) * len(self.manifest.seeds)
 
     @property
