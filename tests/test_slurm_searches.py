@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -26,6 +26,7 @@ from space_dist.slurm.arrays import arrays_of
 from space_dist.slurm.export import ADVANCE, JOBS, NEXT, README, SUBMIT, TRAIN, render
 from space_dist.slurm.searches import digest_of_trials, reached, runs_of_task
 from tests.commanding import command
+from tests.shell import one_supervisor
 from tests.slurm.profiles import exports
 from tests.test_racing import population_tune, racing_tune
 from tests.test_slurm import HOSTILE, MODES, Stubs, profile, short, stubs, write  # noqa: F401
@@ -339,12 +340,19 @@ def test_a_search_ends_with_the_same_bytes(
     assert tasks_done >= 12
 
 
-@pytest.mark.parametrize("made", [racing_tune, population_tune])
+@pytest.fixture
+def _one_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with one_supervisor(tmp_path_factory.mktemp("supervisor")):
+        yield
+
+
+@pytest.mark.usefixtures("_one_process")
+@pytest.mark.parametrize(("made", "seeds"), [(racing_tune, [0, 1]), (population_tune, [0])])
 def test_trials_that_are_paused_go_on_in_later_arrays(
-    made: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: Callable[..., Path], seeds: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Trained here, each task in its turn, as jobs do it; one of each array's is lost."""
-    path = made(tmp_path, arms={"a": {}})
+    path = made(tmp_path, arms={"a": {}}, seeds=seeds)
     here = run_search(path, root=tmp_path / "runs", progress=False).grid
     assert command(monkeypatch, "slurm", "export", path, "--out", tmp_path / "out") == 0
     grid, after, arrays = Grid(tmp_path / "out"), "first", 0
