@@ -196,7 +196,7 @@ def test_commands_tell_how_a_search_stands(
     assert command(monkeypatch, "grid", "run", root / "search") == 2
     assert "holds a search: space-dist tune run" in capsys.readouterr().err
     assert command(monkeypatch, "slurm", "export", root / "search", "--out", tmp_path / "out") == 2
-    assert "is a search" in capsys.readouterr().err
+    assert "holds a search that has begun" in capsys.readouterr().err
 
 
 def test_a_missing_optuna_is_named_with_its_extra(
