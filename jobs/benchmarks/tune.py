@@ -136,9 +136,7 @@ def _ours(folder: Path, search: Mapping[str, Any], kernel: float = 0.0) -> Taken
     file.write_text(configs.to_yaml(dict(search)))
     words = [sys.executable, "-P", "-m", "space_dist.cli", "tune", "run", str(file), "--root", str(folder / "runs")]
     start = time.perf_counter()
-    done = subprocess.run(
-        words, capture_output=True, text=True, check=False, cwd=folder, env=throughput.environment_of("")
-    )  # fmt: skip
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=folder, env=_environment())
     seconds = time.perf_counter() - start
     if done.returncode:
         raise SpaceDistError(f"the search did not complete: {done.stdout[-2000:]}{done.stderr[-2000:]}")
@@ -159,6 +157,13 @@ def _ours(folder: Path, search: Mapping[str, Any], kernel: float = 0.0) -> Taken
         {"updating (the kernel alone)": update, "collecting, evaluating, ledgers": running - update,
          "starting, asking": 1.0 - running},
     )  # fmt: skip
+
+
+def _environment() -> dict[str, str]:
+    """Of both: modules are compiled once, as those of an installation are, whatever this process was told."""
+    found = throughput.environment_of("")
+    found.pop("PYTHONDONTWRITEBYTECODE", None)
+    return found
 
 
 def _evaluation_steps(row: Mapping[str, Any]) -> int:
@@ -185,8 +190,7 @@ def _optuna(folder: Path, seeds: int, n_envs: int) -> Taken:
         raise SpaceDistError("runs of the search were not evaluated after the same numbers of steps")
     asked = Asked(str(folder), seeds, schedules.pop(), n_envs, cores())
     # The libraries' own choice of kernels, as a script has it that knows nothing of ours.
-    environment = throughput.environment_of("") | {CHOICE: "native"}
-    environment |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+    environment = {**_environment(), CHOICE: "native", "OPENBLAS_NUM_THREADS": "1", "NUMEXPR_NUM_THREADS": "1"}
     code = "from benchmarks.optuna_study import main; main()"
     words = [sys.executable, "-P", "-W", "ignore", "-c", code, json.dumps(asdict(asked))]
     start = time.perf_counter()
@@ -222,7 +226,7 @@ def _markdown(rows: Mapping[str, Row], trials: int, seeds: int) -> str:
         f"{trials} trials of {seeds} seeds on {cores()} cores, whole wall time from a process's start to its end: "
         f"medians of {len(ours.taken)} interleaved rounds (least and most), ratios of the rounds' own. Optuna's study "
         "tries the settings that ours has drawn, with the same seeds, instances, evaluations and network. "
-        f"{libraries}; space_dist {git_state().get('commit', 'without a commit')[:7]}.",
+        f"{libraries}; space_dist {git_state().get('git_commit', 'of no commit')[:12]}.",
         "",
         "| | wall time | ratio to ours | training steps | evaluation steps | training steps/s | mean of the trials "
         "| where the time goes |",
