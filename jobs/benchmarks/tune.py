@@ -98,15 +98,13 @@ def tune(
     for number in range(rounds):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            rows["ours"].taken.append(_ours(folder, _search(trials, seeds, steps, generation), kernel))
-            for rival, count in (("optuna", seeds), ("one_seed", 1)):
-                if rival in rows:
-                    rows[rival].taken.append(_optuna(folder / "runs" / NAME, count, chosen))
-        for row in rows.values():
-            console.print(
-                f"round {number + 1}: {row.title}: {row.seconds[-1]:.1f} s", markup=False, highlight=False,
-                soft_wrap=True,
-            )  # fmt: skip
+            for who, row in rows.items():
+                row.taken.append(
+                    _ours(folder, _search(trials, seeds, steps, generation), kernel) if who == "ours" else
+                    _optuna(folder / "runs" / NAME, 1 if who == "one_seed" else seeds, chosen)
+                )  # fmt: skip
+                told = f"round {number + 1}: {row.title}: {row.seconds[-1]:.1f} s"
+                console.print(told, markup=False, highlight=False, soft_wrap=True)
     _refuse_other_work(rows)
     console.print(_markdown(rows, trials, seeds), markup=False, highlight=False, soft_wrap=True)
     keep({name: [asdict(one) for one in row.taken] for name, row in rows.items()}, json_file)
