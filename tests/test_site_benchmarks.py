@@ -7,6 +7,7 @@ tests/test_throughput.py has them. `chaos` is asked what it is asked, and tests/
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -113,8 +114,8 @@ def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
     def run(words: list[str], **how: Any) -> Any:
         if words[1:4] == ["-P", "-m", "space_dist.cli"]:
-            monkeypatch.chdir(how["cwd"])
-            return subprocess.CompletedProcess(words, command(monkeypatch, *words[4:]))
+            with contextlib.chdir(how["cwd"]):
+                return subprocess.CompletedProcess(words, command(monkeypatch, *words[4:]))
         if "from benchmarks.optuna_study import main; main()" not in words:
             return ran(words, **how)
         assert (how["env"]["SPACE_DIST_ARITHMETIC"], how["env"].keys() & SETTINGS.keys()) == ("native", set())
