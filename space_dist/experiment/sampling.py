@@ -82,7 +82,7 @@ def explored(
     Each setting is drawn anew, with the chance `resample`, or multiplied by one of the factors, each as likely, and
     kept within its range. Source: Jaderberg et al. 2017, truncation selection and perturbation.
     """
-    space = _space(search, arm)
+    space = space_of(search, arm)
     seed = _sampler_seed(int(search.config["seed"]), arm, rung)
     random = np.random.default_rng(seed)
     with _quietly():
@@ -90,7 +90,7 @@ def explored(
         found = []
         for _ in range(count):
             parent = best[int(random.integers(len(best)))]
-            anew = _drawn(study.ask(), space)
+            anew = drawn(study.ask(), space)
             setting = {key: anew[key] if random.random() < population.resample
                        else _perturbed(one, parent.parameters[key], random.choice(population.factors))
                        for key, one in space.items()}  # fmt: skip
