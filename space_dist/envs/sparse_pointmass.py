@@ -1,7 +1,7 @@
 """PointMass with a reward that most policies never see: 1 at the goal, where the episode ends, and nothing before.
 
-The world is PointMass (`space_dist.envs.pointmass`, Klink et al. 2020); reward, end, radius and units of actions are
-ours, chosen so that a policy that does nothing sensible succeeds on a few instances, and on most of them on none.
+The world is PointMass (`space_dist.envs.pointmass`, Klink et al. 2020); reward, end and radius are those of PointMass-s
+of Tzannetos et al. 2023. That actions are in [-1, 1] is ours.
 """
 
 from __future__ import annotations
