@@ -19,6 +19,7 @@ from benchmarks import (
     off_policy,
     pic,
     throughput,
+    tune,
 )
 from rich.console import Console
 
@@ -39,6 +40,7 @@ for _benchmark in (
     off_policy.off_policy,
     pic.pic,
     throughput.throughput,
+    tune.tune,
 ):
     app.command()(_benchmark)
 

@@ -107,12 +107,16 @@ def test_mlflow_shows_runs_at_the_first_look_and_three_levels(
 ) -> None:
     address, result = mirrored
     (first,) = result.pages
+    grid, cells, runs = levels(address)
+    page, errors = opened(browser, first.partition("#")[0] + "#/experiments", folder / "experiments.png", see="demo")
+    assert not errors_of_ours(errors)
+    page.close()
     page, errors = opened(browser, first, folder / "runs.png", see="matching runs")
-    page.get_by_role("link", name="demo").last.wait_for(timeout=PATIENCE * 1000)
+    page.locator(f'a[href*="{grid.info.run_id}"]').first.wait_for(timeout=PATIENCE * 1000)
+    page.screenshot(path=folder / "runs.png")
     assert not errors_of_ours(errors)
     page.close()
 
-    grid, cells, runs = levels(address)
     base = first.partition("?")[0]
     for name, run, text in (
         ("grid", grid, "test/return_iqm eta 0.2"),
@@ -121,6 +125,9 @@ def test_mlflow_shows_runs_at_the_first_look_and_three_levels(
     ):
         url = f"{base}/{run.info.run_id}?workflowType=machine_learning"
         page, errors = opened(browser, url, folder / f"{name}.png", see=text)
+        page.get_by_text("Model metrics").first.click()
+        page.locator(".plotly, canvas, svg.main-svg").first.wait_for(timeout=PATIENCE * 1000)
+        page.screenshot(path=folder / f"{name}_metrics.png")
         assert not errors_of_ours(errors)
         page.close()
     page, errors = opened(browser, f"{base}/{grid.info.run_id}/artifacts", folder / "artifacts.png", see="report.html")

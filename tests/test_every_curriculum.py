@@ -41,6 +41,8 @@ KINDS = {
     "alp_gmm_bounds": "{kind: alp_gmm, fit_rate: 12, over: bounds}",
     "plr": "{kind: plr}",
     "learnability": "{kind: learnability, top: 2, every: 2, episodes: 2}",
+    "procurl": "{kind: procurl}",
+    "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
     "manual": "{kind: manual, column: effort}",
 }
 

@@ -27,6 +27,7 @@ from space_dist.curricula.alp_gmm import AlpGmm, absolute_progress, component_ch
 from space_dist.curricula.configured import Makers
 from space_dist.curricula.draws import effective_size, proportional
 from space_dist.curricula.learnability import Learnability, learnable_chances
+from space_dist.curricula.procurl import Proximal, scaled, softmax
 from space_dist.curricula.vds import ValueDisagreement, disagreement
 from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
@@ -318,6 +319,45 @@ def test_the_first_probe_waits_for_the_first_success_and_the_next_for_its_turn()
     assert unknown.episodes is not None
     unknown.episodes.success[:] = np.nan
     assert sfl.probes(sfl.start()[0], unknown.episodes) is None
+
+
+# ---- ProCuRL --------------------------------------------------------------------------------------------------------
+
+
+def test_procurl_by_hand() -> None:
+    train, draws = instances(5), Draws(20, 2)
+    values = np.array([-0.5, 0.0, 0.5, 0.75, 2.0])
+    told = dataclasses.replace(feedback(0, [0], n=5), values_after=values, values_before=np.array([0.0, 0, 0, 1, 1]))
+    made = Proximal(train, seed=0, draws=draws, beta=math.log(16.0), score="zone", scale="largest", largest=1.0)
+    state, selection, numbers = made.step(made.start()[0], told)
+    # p = 0, 0, 1/2, 3/4, 1, so 16 to the power of p (1 - p) is 1, 1, 2, 16^(3/16) = 2^(3/4), 1.
+    weights = np.array([1.0, 1.0, 2.0, 2.0**0.75, 1.0])
+    np.testing.assert_allclose(state.chances, weights / weights.sum())
+    assert (numbers["mean_score"], numbers["largest_score"]) == (pytest.approx(7 / 80), 0.25)
+    assert len(selection.ids) == 20
+    # Of a set from -0.5 to 2: 0, 0.2, 0.4, 0.5, 1.
+    np.testing.assert_allclose(scaled(values, "set", 1.0), [0.0, 0.2, 0.4, 0.5, 1.0])
+    np.testing.assert_allclose(scaled(values, "largest", 2.0), [0.0, 0.0, 0.25, 0.375, 1.0])
+    assert scaled(np.full(3, 0.7), "set", 1.0).tolist() == [0.0] * 3
+
+
+def test_procurls_control_goes_by_what_values_have_risen() -> None:
+    values = np.array([-0.5, 0.0, 0.5, 0.75, 2.0])
+    told = dataclasses.replace(feedback(0, [0], n=5), values_after=values, values_before=np.array([0.0, 0, 0, 1, 1]))
+    chances = []
+    for scale in ("largest", "set"):
+        made = Proximal(
+            instances(5), seed=0, draws=Draws(20, 2), beta=math.log(4.0), score="improvement", scale=scale, largest=2.0
+        )
+        chances.append(made.step(made.start()[0], told)[0].chances)
+    # They rose by -0.5, 0, 0.5, -0.25 and 1; halved, or from 0 to 1.
+    for found, powers in zip(chances, ([-0.25, 0, 0.25, -0.125, 0.5], [0, 1 / 3, 2 / 3, 1 / 6, 1]), strict=True):
+        weights = 4.0 ** np.array(powers)
+        np.testing.assert_allclose(found, weights / weights.sum())
+
+
+def test_large_values_do_not_overflow() -> None:
+    assert np.isfinite(softmax(np.array([0.0, 1e5]), 20.0)).all()
 
 
 # ---- ALP-GMM --------------------------------------------------------------------------------------------------------

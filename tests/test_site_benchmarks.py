@@ -1,12 +1,13 @@
 """The benchmarks that pages have one type: executed by bash as they are written, with their smallest sizes.
 
-`kernel`, `off-policy` and `equivalence` measure, a few minibatches and runs. `throughput` searches, counts rounds,
-draws its table and keeps its files, while what its processes answer is made up: they take minutes, and
+`kernel`, `off-policy`, `equivalence` and `tune` measure, a few minibatches and runs. `throughput` searches, counts
+rounds, draws its table and keeps its files, while what its processes answer is made up: they take minutes, and
 tests/test_throughput.py has them. `chaos` is asked what it is asked, and tests/chaos/test_chaos.py rehearses.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -14,12 +15,14 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 
+from space_dist.arithmetic import SETTINGS
 from tests.commanding import command
 from tests.grids import ROOT
 from tests.shell import Shell, executes, one_supervisor
@@ -27,7 +30,7 @@ from tests.shell import Shell, executes, one_supervisor
 sys.path.append(str(ROOT / "jobs"))
 
 import benchmark
-from benchmarks import chaos, contenders, equivalence, kernel, off_policy, throughput
+from benchmarks import chaos, contenders, equivalence, kernel, off_policy, optuna_study, throughput, tune
 from benchmarks.faults import KINDS, Fault, Hit, Result
 
 
@@ -102,6 +105,51 @@ def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert "PointMass, round_robin, 4,096 steps, the same 3 seeds" in told
     assert codes == [0 if "yes" in told else 1]
     assert len(list((bench.folder / "kept").glob("*/*/s*/model.npz"))) == 9
+
+
+@executes(("performance.md", 4))
+def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two trials of two seeds and an update each; Optuna's study with all seeds in processes of its own."""
+    ran, studies = subprocess.run, []
+
+    def run(words: list[str], **how: Any) -> Any:
+        if words[1:4] == ["-P", "-m", "space_dist.cli"]:
+            with contextlib.chdir(how["cwd"]):
+                return subprocess.CompletedProcess(words, command(monkeypatch, *words[4:]))
+        if "from benchmarks.optuna_study import main; main()" not in words:
+            return ran(words, **how)
+        assert (how["env"]["SPACE_DIST_ARITHMETIC"], how["env"].keys() & SETTINGS.keys()) == ("native", set())
+        given = json.loads(words[-1])
+        studies.append(given)
+        if given["seeds"] > 1:
+            return ran(words, **how)
+        with ThreadPoolExecutor(1) as pool:
+            found = optuna_study.studied(optuna_study.Asked(**given), pool)
+        return subprocess.CompletedProcess(words, 0, json.dumps(found))
+
+    monkeypatch.setattr(tune.subprocess, "run", run)
+    monkeypatch.setattr(tune, "cores", lambda: 1)
+    monkeypatch.setattr(throughput, "process", lambda *_: {"kernel": 1e-6})
+    sizes = {"trials": 2, "seeds": 2, "generation": 1, "steps": 2048, "rounds": 1, "n-envs": 64}
+    bench.more = tuple(word for name, size in sizes.items() for word in (f"--{name}", str(size)))
+    with one_supervisor(bench.folder):
+        bench.block("performance.md", 4)
+    assert [(one["seeds"], one["evaluations"], one["processes"]) for one in studies] == [(2, [0, 2048], 1),
+                                                                                         (1, [0, 2048], 1)]  # fmt: skip
+    taken = {name: rounds for name, (*rounds,) in json.loads((bench.folder / "tune.json").read_text()).items()}
+    assert {name: [one["steps"] for one in rounds] for name, rounds in taken.items()} == {
+        "ours": [4 * 2048], "optuna": [4 * 2048], "one_seed": [2 * 2048]
+    }  # fmt: skip
+    for (one,) in taken.values():
+        runs = one["steps"] // 2048
+        # Two evaluations of a run, on 100 instances of each set, of at most 100 steps.
+        assert runs * 2 * 200 <= one["evaluation_steps"] <= runs * 2 * 200 * 100
+        assert (len(one["values"]), sum(one["shares"].values())) == (2, pytest.approx(1.0))
+    # PPO learns nothing in one update: whoever is measured otherwise would be seen here.
+    assert taken["optuna"][0]["values"] == pytest.approx(taken["ours"][0]["values"], rel=0.5)
+    told = capsys.readouterr().out
+    assert "2 trials of 2 seeds on 1 cores" in told
+    assert "2 seeds a trial cost " in told
 
 
 @executes(("performance.md", 0))

@@ -59,6 +59,21 @@ def test_our_batched_environments_step_in_stable_baselines3s_interface_as_by_the
     assert ends >= 9
 
 
+def test_batched_environments_take_instances_in_turn_from_the_first_at_every_reset() -> None:
+    contexts = np.array([[-0.5], [0.25], [0.75]])
+    env = BatchedVecEnv(make_batched(LINE, 2, context_visible=True), contexts, seed=0, in_turn=True)
+    still = np.zeros((2, *env.action_space.shape), dtype=np.float32)
+    for _ in range(2):
+        found = [env.reset()[:, -1]]
+        for _ in range(3):
+            dones = np.zeros(2, dtype=np.bool_)
+            while not dones.any():
+                observations, _, dones, _ = env.step(still)
+            assert dones.all()
+            found.append(observations[:, -1])
+        np.testing.assert_allclose(np.concatenate(found), [-0.5, 0.25, 0.75, -0.5, 0.25, 0.75, -0.5, 0.25])
+
+
 def test_ratios_are_medians_of_the_rounds_own() -> None:
     # A machine that slows down to a tenth after the first round slows both.
     assert _ratio(row(400.0, 40.0, 30.0), row(100.0, 10.0, 10.0)) == pytest.approx(4.0)

@@ -12,22 +12,33 @@ from space_dist.envs import BatchedEnv
 
 
 class BatchedVecEnv(VecEnv):
-    """Resets slots by itself, each to a context drawn from `contexts` (n, d), as SB3 wants it."""
+    """Resets slots by itself, as SB3 wants it, each to one of `contexts` (n, d).
 
-    def __init__(self, env: BatchedEnv, contexts: NDArray[np.float64], *, seed: int) -> None:
+    in_turn: to one after another, from the first at every `reset` (round robin); they are drawn otherwise.
+    """
+
+    def __init__(self, env: BatchedEnv, contexts: NDArray[np.float64], *, seed: int, in_turn: bool = False) -> None:
         self._env, self._contexts = env, contexts
+        self._in_turn, self._begun = in_turn, 0
         self._random = np.random.default_rng(seed)
         self._actions: NDArray[Any] = np.zeros(0)
         super().__init__(env.n_slots, env.observation_space, env.action_space)
 
     def reset(self) -> Any:
         """Start all slots anew."""
+        self._begun = 0
         self._observations = self._start(np.arange(self.num_envs))
         return self._observations
 
     def _start(self, slots: NDArray[np.int64]) -> Any:
-        contexts = self._contexts[self._random.integers(len(self._contexts), size=len(slots))]
-        return self._env.reset(slots, contexts, self._random.integers(1 << 62, size=len(slots), dtype=np.uint64))
+        if self._in_turn:
+            rows = np.arange(self._begun, self._begun + len(slots)) % len(self._contexts)
+            self._begun += len(slots)
+        else:
+            rows = self._random.integers(len(self._contexts), size=len(slots))
+        return self._env.reset(
+            slots, self._contexts[rows], self._random.integers(1 << 62, size=len(slots), dtype=np.uint64)
+        )
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for `step_wait`."""

@@ -320,13 +320,18 @@ def _sb3(task: Task, contender: Contender, watch: _Stopwatch) -> None:
     if contender.kind == "sbx":
         _start_xla(contender)
     algorithm: Any = importlib.import_module({"sb3": "stable_baselines3", "sbx": "sbx"}[contender.kind]).PPO
-    algorithm(
-        "MlpPolicy", env, n_steps=task.n_steps // n_envs, batch_size=task.batch_size, n_epochs=EPOCHS, device="cpu",
-        gamma=settings.gamma, gae_lambda=settings.gae_lambda, learning_rate=settings.learning_rate,
-        ent_coef=settings.ent_coef, vf_coef=settings.vf_coef, clip_range=settings.clip_range, seed=0,
-        policy_kwargs={"net_arch": list(settings.net_arch)},
-    ).learn(10**9, callback=Marks())  # fmt: skip
+    algorithm("MlpPolicy", env, seed=0, **stock_arguments(settings, n_envs)).learn(10**9, callback=Marks())
     env.close()
+
+
+def stock_arguments(settings: PPOConfig, n_envs: int) -> dict[str, Any]:
+    """What SB3's PPO, or SBX's, is made with to learn by these settings, of so many environments on a CPU."""
+    return {
+        "n_steps": settings.n_steps // n_envs, "batch_size": settings.batch_size, "n_epochs": settings.n_epochs,
+        "gamma": settings.gamma, "gae_lambda": settings.gae_lambda, "learning_rate": settings.learning_rate,
+        "ent_coef": settings.ent_coef, "vf_coef": settings.vf_coef, "clip_range": settings.clip_range,
+        "policy_kwargs": {"net_arch": list(settings.net_arch)}, "device": "cpu",
+    }  # fmt: skip
 
 
 def _settings(task: Task) -> tuple[configs.RunConfig, PPOConfig]:

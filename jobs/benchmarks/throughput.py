@@ -199,12 +199,12 @@ def _search(task: str, seconds: float, missing: Collection[str]) -> dict[str, Co
         for kind, counts in (("subproc", SUBPROCESSES), ("dummy", DUMMY))
         for n in counts
     ]
-    found = {"subproc2": _best(task, subproc, seconds), "best_sb3": _best(task, stock, seconds)}
-    found["sb3_batched"] = _best(task, [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED], seconds)
+    found = {"subproc2": fastest(task, subproc, seconds), "best_sb3": fastest(task, stock, seconds)}
+    found["sb3_batched"] = fastest(task, [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED], seconds)
     for name in ("best_sb3", "sb3_batched"):
-        found[name] = _best(task, [found[name], replace(found[name], threads=CORES)], seconds)
+        found[name] = fastest(task, [found[name], replace(found[name], threads=CORES)], seconds)
     if "rllib" not in missing:
-        found["rllib"] = _best(task, [Contender("rllib", runners=r, n_envs=n) for r, n in RUNNERS], seconds)
+        found["rllib"] = fastest(task, [Contender("rllib", runners=r, n_envs=n) for r, n in RUNNERS], seconds)
     if "sbx" not in missing:
         found["sbx"] = _best_sbx(task, seconds)
     if task in JITTED and "jax" not in missing:
@@ -215,7 +215,7 @@ def _search(task: str, seconds: float, missing: Collection[str]) -> dict[str, Co
     else:
         for update in ("stock", "lean"):
             ours = [Contender("ours", update=update, slots=slots) for slots in SLOTS]
-            found[update] = _best(task, ours, seconds)
+            found[update] = fastest(task, ours, seconds)
     return found
 
 
@@ -240,16 +240,18 @@ def _rows(task: str, found: dict[str, Contender], seconds: float, checkout: str)
 
 def _best_sbx(task: str, seconds: float) -> Contender:
     contenders = [Contender("sbx", vec_env="batched", n_envs=n, flags=XLA_FLAGS[0]) for n in BATCHED]
-    best = _best(task, contenders, seconds)
-    return _best(task, [replace(best, flags=flags) for flags in ("", *XLA_FLAGS)], seconds)
+    best = fastest(task, contenders, seconds)
+    return fastest(task, [replace(best, flags=flags) for flags in ("", *XLA_FLAGS)], seconds)
 
 
 def _best_jax(task: str, seconds: float, *, members: int) -> Contender:
-    best = _best(task, [Contender("jax", members=members, flags=XLA_FLAGS[0], slots=slots) for slots in SLOTS], seconds)
-    return _best(task, [replace(best, flags=flags) for flags in XLA_FLAGS], seconds)
+    best = fastest(
+        task, [Contender("jax", members=members, flags=XLA_FLAGS[0], slots=slots) for slots in SLOTS], seconds
+    )
+    return fastest(task, [replace(best, flags=flags) for flags in XLA_FLAGS], seconds)
 
 
-def _best(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
+def fastest(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
     """The fastest in one short measurement each; one that does not get it done in a minute is none."""
     rates = {
         contender: _measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders
@@ -285,7 +287,7 @@ def _search_population(seconds: float, missing: Collection[str]) -> dict[str, Co
         "best_sb3": [Contender("sb3", vec_env="dummy", n_envs=n) for n in DUMMY],
         "sb3_batched": [Contender("sb3", vec_env="batched", n_envs=n) for n in BATCHED],
     }
-    found = {name: _best("pointmass", contenders, seconds) for name, contenders in rivals.items()}
+    found = {name: fastest("pointmass", contenders, seconds) for name, contenders in rivals.items()}
     if "sbx" not in missing:
         found["sbx"] = _best_sbx("pointmass", seconds)
     if "jax" not in missing:
@@ -381,7 +383,7 @@ def process(wanted: str, first: str, checkout: str = "") -> dict[str, float]:
 
 def _start(wanted: str, first: str, checkout: str = "") -> subprocess.Popen[str]:
     # OpenMP's threads are what torch's contenders set themselves; everything else keeps to one.
-    environment = _environment(checkout)
+    environment = environment_of(checkout)
     environment |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
     code = f"{first}; from benchmarks.contenders import main; main()"
     return subprocess.Popen(
@@ -390,7 +392,7 @@ def _start(wanted: str, first: str, checkout: str = "") -> subprocess.Popen[str]
     )  # fmt: skip
 
 
-def _environment(checkout: str) -> dict[str, str]:
+def environment_of(checkout: str) -> dict[str, str]:
     """That of a process with this `space_dist` or another, without what ours has told libraries."""
     found = {name: value for name, value in os.environ.items() if name not in SETTINGS}
     return found | {"PYTHONPATH": os.pathsep.join([checkout or str(ROOT), str(ROOT / "jobs")])}
@@ -435,7 +437,7 @@ def _grid_seconds(
         command += ["grid", "run", str(path), "--root", str(folder / "runs")]
         start = time.perf_counter()
         done = subprocess.run(
-            command, capture_output=True, text=True, check=False, cwd=folder, env=_environment(checkout)
+            command, capture_output=True, text=True, check=False, cwd=folder, env=environment_of(checkout)
         )  # fmt: skip
         seconds = time.perf_counter() - start
         if done.returncode:

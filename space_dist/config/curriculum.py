@@ -379,6 +379,32 @@ class LearnabilityConfig(_Curriculum):
         return True
 
 
+class ProximalConfig(_Curriculum):
+    """ProCuRL (Tzannetos et al. 2023): instances whose value says that they succeed sometimes, by a softmax.
+
+    No probes. Values are taken for probabilities of success, which they are where an episode's return is 1 or 0, or
+    after scaling.
+    """
+
+    kind: Literal["procurl"]
+    """Which curriculum: ProCuRL."""
+    score: Literal["zone", "improvement"] = "zone"
+    """zone: p (1 - p). improvement: by how much the value has risen in the last iteration (its authors' control
+    `space-alt`). Source: Tzannetos et al. 2023."""
+    beta: float = Field(default=20.0, gt=0.0)
+    """Inverse temperature of the softmax. Source: the authors' code (20)."""
+    scale: Literal["largest", "set"] = "largest"
+    """What makes probabilities of values. largest: divided by `largest_return`, cut off at 0 and 1; for sparse rewards.
+    set: from 0 for the least value of the set to 1 for the greatest. Source: the authors' code (both)."""
+    largest_return: float = Field(default=1.0, gt=0.0)
+    """Of scale: largest: the largest discounted return of an episode, in reward units."""
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """See `_Curriculum`."""
+        return True
+
+
 class CustomConfig(_Curriculum):
     """A curriculum of your own: any that keeps the protocol (docs/your_curriculum.md)."""
 
@@ -433,6 +459,7 @@ CurriculumConfig = Annotated[
     | AlpGmmConfig
     | LevelReplayConfig
     | LearnabilityConfig
+    | ProximalConfig
     | CustomConfig,
     Field(discriminator="kind"),
 ]

@@ -16,6 +16,7 @@ from space_dist.config import (
     LearnabilityConfig,
     LevelReplayConfig,
     ManualConfig,
+    ProximalConfig,
     RandomGrowthConfig,
     RoundRobinConfig,
     SelfPacedConfig,
@@ -31,6 +32,7 @@ from space_dist.curricula.gaussian import Gaussian
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
 from space_dist.curricula.plr import LevelReplay
+from space_dist.curricula.procurl import Proximal
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
 from space_dist.curricula.spdrl import SelfPaced
@@ -65,6 +67,7 @@ class Makers:
             AlpGmmConfig: self._alp_gmm,
             LevelReplayConfig: self._level_replay,
             LearnabilityConfig: self._learnability,
+            ProximalConfig: self._proximal,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -151,6 +154,12 @@ class Makers:
         return Learnability(
             self._train, seed=self._seed, draws=self._draws, top=settings.top, uniform_share=settings.uniform_share,
             every=settings.every, candidates=settings.candidates, episodes=settings.episodes,
+        )  # fmt: skip
+
+    def _proximal(self, settings: ProximalConfig) -> Proximal:
+        return Proximal(
+            self._train, seed=self._seed, draws=self._draws, beta=settings.beta, score=settings.score,
+            scale=settings.scale, largest=settings.largest_return,
         )  # fmt: skip
 
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:

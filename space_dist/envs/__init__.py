@@ -32,12 +32,14 @@ from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
 from space_dist.envs.singles import BatchedSingles
+from space_dist.envs.sparse_pointmass import BatchedSparsePointMass
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds
 from space_dist.system.importing import load
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
+    "space_dist/SparsePointMass-v0": BatchedSparsePointMass,
     "space_dist/CartPole-v0": BatchedCartPole,
     "space_dist/AntGoal-v0": BatchedAntGoal,
     "space_dist/BallCatching-v0": BatchedBallCatching,
@@ -229,6 +231,7 @@ __all__ = [
     "BatchedMaze",
     "BatchedPointMass",
     "BatchedSingles",
+    "BatchedSparsePointMass",
     "ContextObservation",
     "ContextVisible",
     "Distribution",

@@ -48,7 +48,7 @@ def draw(search: Search, arm: str, count: int) -> list[dict[str, Any]]:
     generation = search.generation + 1
     with _quietly():
         study = _study(search, arm, _sampler(search, arm, generation))
-        return [_drawn(study.ask(), _space(search, arm)) for _ in range(count)]
+        return [drawn(study.ask(), space_of(search, arm)) for _ in range(count)]
 
 
 def completions(space: Mapping[str, Distribution], seed: int, key: str, value: Any, count: int) -> list[dict[str, Any]]:
@@ -57,7 +57,7 @@ def completions(space: Mapping[str, Distribution], seed: int, key: str, value: A
         sampler = RandomSampler(seed=_sampler_seed(seed, key, _NO_GENERATION))
         study = optuna.create_study(sampler=sampler)
         # What the key's own condition names comes first: else it would be drawn by chance only.
-        return [_drawn(study.ask(), space, {**_needed(space, key), key: value}) for _ in range(count)]
+        return [drawn(study.ask(), space, {**_needed(space, key), key: value}) for _ in range(count)]
 
 
 def _needed(space: Mapping[str, Distribution], key: str) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def explored(
     Each setting is drawn anew, with the chance `resample`, or multiplied by one of the factors, each as likely, and
     kept within its range. Source: Jaderberg et al. 2017, truncation selection and perturbation.
     """
-    space = _space(search, arm)
+    space = space_of(search, arm)
     seed = _sampler_seed(int(search.config["seed"]), arm, rung)
     random = np.random.default_rng(seed)
     with _quietly():
@@ -90,7 +90,7 @@ def explored(
         found = []
         for _ in range(count):
             parent = best[int(random.integers(len(best)))]
-            anew = _drawn(study.ask(), space)
+            anew = drawn(study.ask(), space)
             setting = {key: anew[key] if random.random() < population.resample
                        else _perturbed(one, parent.parameters[key], random.choice(population.factors))
                        for key, one in space.items()}  # fmt: skip
@@ -115,7 +115,7 @@ def given_up(search: Search, arm: str, trials: Sequence[Trial], pruner: Pruner) 
     median: BasePruner = MedianPruner(n_startup_trials=pruner.startup)
     with _quietly():
         study = _study(search, arm, RandomSampler(seed=0))
-        return {trial.number for trial in trials if median.prune(study, _frozen(trial, _space(search, arm)))}
+        return {trial.number for trial in trials if median.prune(study, _frozen(trial, space_of(search, arm)))}
 
 
 def importance(search: Search, arm: str) -> dict[str, float]:
@@ -140,7 +140,7 @@ def importance(search: Search, arm: str) -> dict[str, float]:
 def _study(search: Search, arm: str, sampler: BaseSampler) -> optuna.Study:
     """Everything that the arm's trials were told, in their order; open ones are not in it."""
     study = optuna.create_study(direction="maximize" if search.maximizes else "minimize", sampler=sampler)
-    space = _space(search, arm)
+    space = space_of(search, arm)
     for trial in search.of_arm(arm):
         if trial.state != "open":
             study.add_trial(_frozen(trial, space))
@@ -153,7 +153,7 @@ def _frozen(trial: Trial, space: Mapping[str, Distribution]) -> FrozenTrial:
               "open": TrialState.RUNNING}  # fmt: skip
     return create_trial(
         state=states[trial.state], value=trial.value,
-        params={key: _inner(space[key], value) for key, value in trial.parameters.items()},
+        params={key: inner(space[key], value) for key, value in trial.parameters.items()},
         distributions={key: _distribution(space[key]) for key in trial.parameters},
         intermediate_values=dict(trial.values),
     )  # fmt: skip
@@ -176,11 +176,11 @@ def _sampler_seed(seed: int, name: str, generation: int) -> int:
     return int(sequence.generate_state(1)[0])
 
 
-def _space(search: Search, arm: str) -> dict[str, Distribution]:
+def space_of(search: Search, arm: str) -> dict[str, Distribution]:
     return {key: Distribution.model_validate(one) for key, one in search.arms[arm].space.items()}
 
 
-def _drawn(
+def drawn(
     trial: optuna.Trial, space: Mapping[str, Distribution], fixed: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """One setting: key by key, in the space's order, where conditions hold."""
@@ -216,7 +216,7 @@ def _outer(one: Distribution, value: Any) -> Any:
     return int(value) if one.ints is not None else json.loads(value)
 
 
-def _inner(one: Distribution, value: Any) -> Any:
+def inner(one: Distribution, value: Any) -> Any:
     """The inverse: what Optuna is told was tried."""
     return value if one.choice is None else json.dumps(value, sort_keys=True)
 

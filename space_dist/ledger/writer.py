@@ -295,8 +295,8 @@ class RunWriter:
         kept = self.ledger.checkpoint_files()
         for file in kept:
             if file.name not in self._named:  # written before this process took the run over
-                with contextlib.suppress(ValueError):
-                    segments = decode_checkpoint(file.read_bytes()).segments
+                with contextlib.suppress(ValueError, LedgerError):
+                    segments = decode_checkpoint(read_whole(file)).segments
                     self._named[file.name] = {segment.name for segment in segments}
         self._named = {file.name: self._named.get(file.name, set()) for file in kept}
         named = set().union(*self._named.values())

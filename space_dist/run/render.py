@@ -364,6 +364,7 @@ class _Maze:
 
 _SCENES: Final[Mapping[str, Scene]] = {
     "space_dist/PointMass-v0": _PointMass(),
+    "space_dist/SparsePointMass-v0": _PointMass(),
     "space_dist/CartPole-v0": _CartPole(),
     "space_dist/Maze-v0": _Maze(),
 }

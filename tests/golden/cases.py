@@ -96,6 +96,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_LEAN, "budget.steps=640", "curriculum.fit_rate=12", "curriculum.components=3",
     ]),
     "plr": ("curricula/pointmass_plr", _LEAN),
+    "procurl": ("sparse_pointmass_procurl", _LEAN),
     "learnability": ("cartpole_dqn_space", [
         *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
         "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024",
