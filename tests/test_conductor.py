@@ -299,16 +299,16 @@ def test_what_became_of_an_attempt_is_as_written_or_done_or_unknown(supervised: 
     grid, _, run = faulty(tmp_path, "none")
     ledger, attempts = grid.ledger(run), Attempts(grid.ledger(run))
     attempts.begin(1, {})
-    assert concluded(ledger, 1) is None
+    assert concluded(run, ledger, 1) is None
     attempts.end(1, Ended(Cause.KILLED, "by a hand"))
-    assert concluded(ledger, 1) == Ended(Cause.KILLED, "by a hand")
-    assert concluded(ledger, 2) is None  # it never began
+    assert concluded(run, ledger, 1) == Ended(Cause.KILLED, "by a hand")
+    assert concluded(run, ledger, 2) is None  # it never began
     assert supervised.attempt(grid, run, 2)["cause"] is None
     rows = attempts.rows()
-    assert concluded(ledger, 2) == concluded(ledger, 3) == Ended(None)  # somebody else's is not written twice
+    assert concluded(run, ledger, 2) == concluded(run, ledger, 3) == Ended(None)  # somebody else's is not written twice
     assert attempts.rows() == rows
     attempts.begin(3, {})
-    assert [concluded(ledger, 3), concluded(ledger, 3)] == [Ended(None)] * 2
+    assert [concluded(run, ledger, 3), concluded(run, ledger, 3)] == [Ended(None)] * 2
     assert [row["event"] for row in attempts.rows()[len(rows) :]] == ["begin", "end"]
 
 
@@ -316,11 +316,13 @@ def test_what_was_seen_of_a_lost_attempt_is_written_once_and_only_if_it_was_one(
     grid, _, run = faulty(tmp_path, "none")
     ledger, attempts = grid.ledger(run), Attempts(grid.ledger(run))
     attempts.begin(1, {})
-    assert isinstance(settled(ledger, 1, Evidence(job="", job_succeeded=True)), Busy)  # somebody else is working on it
+    assert isinstance(
+        settled(run, ledger, 1, Evidence(job="", job_succeeded=True)), Busy
+    )  # somebody else is working on it
     assert attempts.history().last is None
     lost = Ended(Cause.KILLED, "its worker was killed")
-    assert settled(ledger, 1, Evidence(gone="worker")) == attempts.history().last == lost
-    assert settled(ledger, 1, Evidence(gone="worker", node_alive=False)) == lost  # as it is on record
+    assert settled(run, ledger, 1, Evidence(gone="worker")) == attempts.history().last == lost
+    assert settled(run, ledger, 1, Evidence(gone="worker", node_alive=False)) == lost  # as it is on record
     assert [row["event"] for row in attempts.rows()] == ["begin", "end"]
 
 

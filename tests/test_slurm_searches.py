@@ -20,7 +20,8 @@ from space_dist.config import read_yaml, to_yaml
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.grid.tuning import open_runs, plan_search
+from space_dist.grid.trials import open_runs
+from space_dist.grid.tuning import plan_search
 from space_dist.slurm import Export, searches
 from space_dist.slurm.arrays import arrays_of
 from space_dist.slurm.export import ADVANCE, JOBS, NEXT, README, SUBMIT, TRAIN, render

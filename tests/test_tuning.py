@@ -22,7 +22,8 @@ from space_dist.experiment.sampling import given_up
 from space_dist.experiment.status import Attempts
 from space_dist.experiment.tuning import Distribution, Objective, Pruner, TuneConfig, find_tune, load_tune
 from space_dist.grid.planning import plan
-from space_dist.grid.tuning import HeldUpError, advance, confirmation, open_runs, plan_search
+from space_dist.grid.trials import HeldUpError, advance, open_runs
+from space_dist.grid.tuning import confirmation, plan_search
 from space_dist.report import load_run
 from space_dist.report.objective import over_seeds
 from space_dist.report.search_report import build_search_report

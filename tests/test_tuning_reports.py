@@ -16,7 +16,8 @@ from space_dist.experiment.manifest import Grid, GridConfig, Run, load_grid
 from space_dist.experiment.sampling import draw, importance
 from space_dist.experiment.search import Search, Trial
 from space_dist.grid.planning import plan
-from space_dist.grid.tuning import advance, confirmation, open_runs, plan_search
+from space_dist.grid.trials import advance, open_runs
+from space_dist.grid.tuning import confirmation, plan_search
 from space_dist.ledger import Ledger
 from space_dist.report import build_grid_report
 from space_dist.report.search_report import build_search_report

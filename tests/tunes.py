@@ -13,7 +13,8 @@ from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.search import Search
 from space_dist.experiment.status import Attempts
-from space_dist.grid.tuning import advance, open_runs, plan_search
+from space_dist.grid.trials import advance, open_runs
+from space_dist.grid.tuning import plan_search
 from tests.grids import ROOT, SMALL
 from tests.test_report import continue_run, start_run
 

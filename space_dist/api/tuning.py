@@ -81,7 +81,7 @@ def searched_through(
     `advance`, and Interrupted if asked to stop.
     """
     with needed_from("tune", "a search"):
-        from space_dist.grid.tuning import advance, open_runs
+        from space_dist.grid.trials import advance, open_runs
     manifest = place.manifest()  # now: whoever worked on it before us may have asked more
     if manifest.search is None:
         raise ConfigError(f"{place.folder} holds a grid: space-dist grid run {place.folder}")

@@ -1,7 +1,7 @@
 """A search on SLURM: generation after generation as arrays, and between two of them a short job that submits the next.
 
 That job (`advance.sbatch`) reads the search's folder and nothing else: it records what came of the runs, as
-`grid.tuning.advance` does anywhere, and writes down which array is next. Killed, requeued or submitted twice, it finds
+`grid.trials.advance` does anywhere, and writes down which array is next. Killed, requeued or submitted twice, it finds
 what is there and does the same again; nothing but the folder decides what that is.
 """
 
@@ -20,7 +20,7 @@ from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import run_statuses
 from space_dist.grid.conductor import freeze, owning
-from space_dist.grid.tuning import advance, open_runs
+from space_dist.grid.trials import advance, open_runs
 from space_dist.slurm.arrays import Array, arrays_of
 from space_dist.slurm.export import same_search
 from space_dist.system.files import atomic_write, in_words
