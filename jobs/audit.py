@@ -101,7 +101,7 @@ def read(folder: Path) -> Run:
     """A run's ledger."""
     for name in ("config.yaml", "instances_train.csv", "values.jsonl", "curriculum.jsonl", "metrics.jsonl"):
         if not (folder / name).is_file():
-            raise NotAuditableError(f"{folder} has no {name}")
+            raise NotAuditableError(f"{folder} has no {name}; the folder of one run is wanted, runs/NAME/s0 for one")
     sizes = committed(folder)  # before the files: a run that goes on only adds to them
     config = YAML(typ="safe").load((folder / "config.yaml").read_text())
     settings = config["curriculum"]
@@ -294,8 +294,8 @@ def expect(run: Run, iteration: int, which: str, chosen: NDArray[np.int64]) -> N
 
 def main(arguments: list[str]) -> int:
     """The exit code."""
-    if len(arguments) != 1:
-        print("usage: python jobs/audit.py RUN", file=sys.stderr)
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        print("usage: python jobs/audit.py RUN, RUN being the folder of one run, runs/NAME/s0 for one", file=sys.stderr)
         return 2
     try:
         run = read(Path(arguments[0]))

@@ -1,4 +1,6 @@
-"""Draw the figures of docs/concepts.md: `python jobs/concepts.py RUN`, RUN being a finished run of SPaCE on PointMass.
+"""Draw the figures of docs/concepts.md: `python jobs/concepts.py RUN [FOLDER]`.
+
+RUN is a finished run of SPaCE on PointMass; they go into docs/figures, or into FOLDER.
 
 Two are drawn from words; `docs/figures/selections.png` shows which instances RUN trained on, as its ledger says.
 """
@@ -16,6 +18,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from ruamel.yaml import YAML
 
 FIGURES: Final = Path(__file__).parents[1] / "docs/figures"
 INK, ARROW, FILL, QUIET = "#1a1a1a", "#4d4d4d", "#e9e9e9", "#b8b8b8"
@@ -128,6 +131,18 @@ def selections(run: Path) -> Figure:
     return figure
 
 
+def why_not_drawn(run: Path) -> str | None:
+    """What a folder lacks whose selections are to be drawn, in words; None if it lacks nothing."""
+    needed = ("config.yaml", "instances_train.csv", "curriculum.jsonl")
+    if missing := [name for name in needed if not (run / name).is_file()]:
+        return f"it has no {missing[0]}; the folder of one run is wanted, runs/quickstart/CELL/s0 for one"
+    config = YAML(typ="safe").load((run / "config.yaml").read_text())
+    kind, environment = config["curriculum"]["kind"], config["env"]["id"]
+    if (kind, environment) != ("space", "space_dist/PointMass-v0"):
+        return f"it is a run of {kind} on {environment}; one of space on space_dist/PointMass-v0 is wanted"
+    return None
+
+
 def _changes(decisions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The first iteration, the last one, and those between whose selections are nearest to even steps in size."""
     sizes = np.array([len(one["trained"]) for one in decisions])
@@ -135,15 +150,22 @@ def _changes(decisions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [decisions[int(np.argmin(np.abs(sizes - size)))] for size in wanted]
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     """Write the figures."""
-    if len(sys.argv) != 2:
-        sys.exit("usage: python jobs/concepts.py RUN (a folder with the ledger of SPaCE on PointMass)")
-    for name, figure in (("iteration", iteration()), ("grid", grid()), ("selections", selections(Path(sys.argv[1])))):
-        path = FIGURES / f"{name}.png"
+    if len(arguments) not in (1, 2) or arguments[0].startswith("-"):
+        sys.exit(
+            "usage: python jobs/concepts.py RUN [FOLDER]: RUN holds a run of SPaCE on PointMass; FOLDER is where the "
+            "figures go, docs/figures if it is left out"
+        )
+    run, folder = Path(arguments[0]), Path(arguments[1]) if len(arguments) == 2 else FIGURES
+    if (fault := why_not_drawn(run)) is not None:
+        sys.exit(f"concepts: {run}: {fault}")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in (("iteration", iteration()), ("grid", grid()), ("selections", selections(run))):
+        path = folder / f"{name}.png"
         figure.savefig(path, dpi=120, metadata={"Software": None})
         print(path)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

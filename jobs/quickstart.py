@@ -47,7 +47,7 @@ def main() -> int:
         + ("" if len(reached) == len(of_space) else ": the start's value settles too slowly for this short budget")
     )
     say(f"MLflow:  make ui, then {PAGE} (experiment '{manifest.experiment}', {len(found)} runs)")
-    say("Next:    space-dist train configs/pointmass_space.yaml --seed 0   (docs/training.md)")
+    say("Next:    source .venv/bin/activate; space-dist train configs/pointmass_space.yaml   (docs/training.md)")
     return 0
 
 

@@ -223,7 +223,8 @@ def test_rows_that_no_checkpoint_covers_accuse_nobody(run_of: Any, tmp_path: Pat
 
 
 def test_what_cannot_be_audited_is_said(folder: Path, run_of: Any, tmp_path: Path) -> None:
-    assert audited(tmp_path)[0] == 2
+    code, said = audited(tmp_path)
+    assert (code, "the folder of one run is wanted" in said) == (2, True)
     headless = rewritten(run_of("abs"), tmp_path / "headless", VALUES, lambda rows: rows[1:])
     assert audited(headless)[0] == 2
     drawn = config("default", folder, "curriculum={kind: uniform}")

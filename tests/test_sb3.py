@@ -376,8 +376,10 @@ def test_another_curriculum_than_the_model_remembers_is_refused(tmp_path: Path) 
         loaded().learn(40, callback=CurriculumCallback("space", eta=0.2))
     with pytest.raises(ConfigError, match=r"curriculum\.kind was space and is uniform"):
         loaded().learn(40, callback=CurriculumCallback("uniform"))
-    with pytest.raises(ConfigError, match="instances was"):
+    with pytest.raises(ConfigError, match=r"another curriculum: the instances are others\. Ask"):
         loaded(TARGETS[:-1]).learn(40, callback=CurriculumCallback("space", eta=0.4))
+    with pytest.raises(ConfigError, match=r"curriculum\.kappa was the default and is 2\. Ask"):
+        loaded().learn(40, callback=CurriculumCallback("space", eta=0.4, kappa=2))
     anew = CurriculumCallback("uniform", resume=False)
     loaded().learn(40, callback=anew)
     assert anew.selection.version == 1

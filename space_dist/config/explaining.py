@@ -87,6 +87,8 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
         if root is RunConfig and (meant := _SB3_NAMES.get(path[-1])) is not None:
             return f"{where}: {key}: unknown key. What Stable-Baselines3 calls {path[-1]} is {meant} here"
+        if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
+            return f"{where}: {key}: unknown key; keys stand in sections: {' or '.join(f'{s}.{key}' for s in sections)}"
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {key}: this key is required"
@@ -104,6 +106,14 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
             return f"{where}: {key}: {message}"
         return f"{where}: {key}: {message}, not {short(given)}"
     return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
+
+
+def _sections_with(key: str) -> list[str]:
+    """The sections of a run's config that have such a key, of whatever kind they are."""
+    return [
+        name for name, field in RunConfig.model_fields.items()
+        if any(key in model.model_fields for model in _models(field))
+    ]  # fmt: skip
 
 
 def _tags(key: str) -> str:

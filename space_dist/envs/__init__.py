@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -196,6 +197,12 @@ def _refuse_interface(where: str, env: Any) -> None:
             raise ConfigError(f"{where}: its {name} must be {what}, not {str(value)[:80]!r}")
 
 
+def _alike(module: str, name: str) -> str:
+    """`; did you mean 'Lander'?` where an imported module has something callable of such a name."""
+    found = {known for known, value in vars(sys.modules[module]).items() if callable(value)}
+    return nearest(name, found).removesuffix(".")
+
+
 def _find(env_id: str) -> Callable[..., Any]:
     if env_id in BATCHED:
         return BATCHED[env_id]
@@ -218,7 +225,7 @@ def _find(env_id: str) -> Callable[..., Any]:
             f"env.id {env_id!r}: of CARL's modules a config names environments, like carl.envs:CARLCartPole"
         )
     if not callable(found):
-        raise ConfigError(f"env.id {env_id!r}: {module!r} has no function {name!r}")
+        raise ConfigError(f"env.id {env_id!r}: {module!r} has no class or function {name!r}{_alike(module, name)}")
     made: Callable[..., Any] = functools.partial(CarlEnv, found) if is_carl(found) else found
     return made
 

@@ -33,7 +33,10 @@ from space_dist.rollout import Setup
 from space_dist.rollout.policy import MlpPolicy, Policy, Several, to_arrays
 from space_dist.run.starting import start_from, weights_in
 from space_dist.seeding import member_seeds
+from space_dist.system.workplace import cores
 
+# A Ray of our own starts any number of actors, each a process; far beyond its cores a machine only stands still.
+_FEW_ACTORS, _ACTORS_A_CORE = 16, 4
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
 
 
@@ -185,6 +188,7 @@ class Blueprint:
         """Raise ConfigError where this machine, or this process, cannot compute the run as its config says."""
         refuse_machine(self.config)
         _refuse_other_arithmetic(self.config)
+        _refuse_crowds(self.config)
 
     def _refuse_short_budget(self) -> None:
         config = self.config
@@ -225,6 +229,17 @@ class Blueprint:
                 f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} "
                 "does not say (its steps have no `success`)"
             )
+
+
+def _refuse_crowds(config: RunConfig) -> None:
+    """Raise ConfigError for more actors than this machine can start; in a cluster Ray says what it has room for."""
+    workers, address, shards = config.resources.workers, config.resources.address, config.rollout.shards
+    most = max(_FEW_ACTORS, _ACTORS_A_CORE * cores())
+    if address == "local" and isinstance(workers, int) and workers > most:
+        raise ConfigError(
+            f"resources.workers: {workers} rollout actors are more than this machine can start: with {cores()} CPUs, "
+            f"at most {most}. A round has {shards} shards (rollout.shards), so more than {shards} actors gain nothing"
+        )
 
 
 def _refuse_other_arithmetic(config: RunConfig) -> None:

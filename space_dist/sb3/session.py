@@ -434,11 +434,15 @@ class Session:
                 raise ValueError(f"it is a {type(text).__name__}")
             checkpoint = decode_checkpoint(base64.b64decode(text, validate=True))
             asked, now = checkpoint.data["asked"], self._identity()
-            differences = [f"{key} was {before} and is {after}" for key, (before, after) in changes(asked, now).items()]
+            found = changes(asked, now)
+        others = ["the instances are others"] if found.pop("instances", None) else []
+        differences = others + [
+            f"{key} was {_told(before)} and is {_told(after)}" for key, (before, after) in found.items()
+        ]
         if differences:
             raise ConfigError(
-                f"CurriculumCallback: the model remembers another curriculum: {'; '.join(differences)} (None: the "
-                "default). Ask for the same, or begin anew with CurriculumCallback(..., resume=False)"
+                f"CurriculumCallback: the model remembers another curriculum: {'; '.join(differences)}. "
+                "Ask for the same, or begin anew with CurriculumCallback(..., resume=False)"
             )
         with _readable():
             self._restore(checkpoint)
@@ -478,6 +482,10 @@ class Session:
             found, shards=1, slots=found["ids"].shape[1], features=len(env.bounds.names), horizon=env.horizon,
             action_shape=action_space.shape or (),
         )  # fmt: skip
+
+
+def _told(value: object) -> str:
+    return "the default" if value is None else str(value)
 
 
 @contextlib.contextmanager

@@ -64,6 +64,8 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
         found = getattr(importlib.import_module(module), name, None)
     except (Exception, SystemExit) as error:  # somebody else's module may raise anything
         what = f"{type(error).__name__}: {str(error)[:200]}"
+        if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
+            what += f". It was looked for where Python looks (PYTHONPATH), and last in {Path.cwd()}"
         raise ConfigError(f"{where}: cannot import {module!r}: {what}") from error
     if of_library is not None and isinstance(found, type) and issubclass(found, of_library):
         return found
