@@ -458,14 +458,21 @@ def test_cells_never_look_alike_however_narrow_the_terminal(
 
 def test_time_left_is_told_by_the_rate_of_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from space_dist.cli import overview
-    from space_dist.experiment.manifest import Grid
+    from space_dist.experiment.manifest import Cell, Grid, Run
     from space_dist.grid.conductor import Overview
+    from space_dist.ledger import encode_row
 
     now = [100.0]
     monkeypatch.setattr(overview.time, "monotonic", lambda: now[0])
     left = overview._TimeLeft(Grid(tmp_path))
-    assert left.in_words(Overview(4, 4000)) == ""
+    assert left.in_words(Overview(4, 4000)) == ", 4,000 steps left"
     now[0] += 60.0
-    assert left.in_words(Overview(4, 3000, done=1)) == ", about 0:03:00 left"
+    assert left.in_words(Overview(4, 3000, done=1)) == ", 3,000 steps left, about 0:03:00"
+    run = Run(Cell("0" * 12, "cell", {}, {}), 0)
+    ledger = Grid(tmp_path).ledger(run)
+    ledger.folder.mkdir(parents=True)
+    (ledger.folder / METRICS).write_bytes(encode_row({"kind": "iteration", "steps": 500}) + b'{"kind":"iterat')
+    now[0] += 60.0  # what runs counts by its rows, of which the last is half written
+    assert left.in_words(Overview(4, 3000, done=1, running=[run])) == ", 2,500 steps left, about 0:03:20"
     now[0] += 60.0
     assert left.in_words(Overview(4, 0, done=4)) == ""

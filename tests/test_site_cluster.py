@@ -6,6 +6,7 @@ this machine. In small: tests/shell.py.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import shutil
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from ray._private.authentication_test_utils import reset_auth_token_state
 
 from space_dist.experiment.manifest import Grid
 from space_dist.ledger import Ledger
@@ -65,18 +67,28 @@ def ours(mark: str) -> list[psutil.Process]:
     return found
 
 
+@contextlib.contextmanager
+def ray_reads_its_environment_anew() -> Iterator[None]:
+    """Behind it, for whoever starts Ray in this process next: it reads once whether there is a token."""
+    try:
+        yield
+    finally:
+        reset_auth_token_state()
+
+
 @pytest.fixture(scope="module")
 def place(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     """A home folder, a shared one, a cluster as docs/ray.md starts it, and an MLflow server."""
     mark, sockets = secrets.token_hex(8), Path(f"/tmp/sd{secrets.token_hex(4)}")  # noqa: S108 - must be short
     folder, served = tmp_path_factory.mktemp("clone"), tmp_path_factory.mktemp("mlflow")
     shutil.copy(empty_store, served / "mlflow.db")
-    with pytest.MonkeyPatch.context() as patch, one_supervisor(folder):
+    with ray_reads_its_environment_anew(), pytest.MonkeyPatch.context() as patch, one_supervisor(folder):
         for name, value in {
             MARK: mark, "HOME": str(folder / "home"), "RAY_TMPDIR": str(sockets), "RAY_AUTH_MODE": "token",
             "PYTHONPATH": str(ROOT), "RAY_USAGE_STATS_ENABLED": "0",
         }.items():  # fmt: skip
             patch.setenv(name, value)
+        reset_auth_token_state()
         for made in (folder / "home", sockets):
             made.mkdir()
         with TrackingServer(served, os.environ, folder / "server.txt") as server:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from space_dist.experiment.manifest import Cell, Grid, Manifest
     from space_dist.experiment.status import RunStatus
     from space_dist.grid.conductor import Overview
+    from space_dist.ledger import Ledger
     from space_dist.slurm.queue import Queue
 
 _LOG_SECONDS = 30.0
@@ -56,7 +57,7 @@ def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], No
 
 
 class _TimeLeft:
-    """How long a grid still takes, at the rate of what was seen of it."""
+    """How many steps a grid still takes, and how long, at the rate of what was seen of it."""
 
     def __init__(self, place: Grid) -> None:
         self._place = place
@@ -64,24 +65,33 @@ class _TimeLeft:
         self._looked, self._words = 0.0, ""
 
     def in_words(self, overview: Overview) -> str:
-        """`, about 0:12:00 left`; nothing as long as that cannot be told."""
+        """`, 614,400 steps left, about 0:12:00`; the time as soon as it can be told."""
         now = time.monotonic()
         if now - self._looked >= _COUNT_SECONDS or not overview.steps_left:
             self._looked, self._words = now, self._estimated(overview, now)
         return self._words
 
     def _estimated(self, overview: Overview, now: float) -> str:
-        taken = 0
-        for run in overview.running:
-            with contextlib.suppress(SpaceDistError):
-                taken += self._place.ledger(run).status().steps
-        left = max(0, overview.steps_left - taken)
+        left = max(0, overview.steps_left - sum(_steps_of(self._place.ledger(run)) for run in overview.running))
         if self._first is None:
             self._first = now, left
         seconds, done = now - self._first[0], self._first[1] - left
-        if not left or done <= 0:
+        if not left:
             return ""
-        return f", about {datetime.timedelta(seconds=round(left * seconds / done))} left"
+        about = f", about {datetime.timedelta(seconds=round(left * seconds / done))}" if done > 0 else ""
+        return f", {left:,} steps left{about}"
+
+
+def _steps_of(ledger: Ledger) -> int:
+    """How far a run is, by its last row, which is newer than its last checkpoint; 0 before it has one."""
+    from space_dist.experiment.status import last_lines
+    from space_dist.ledger import METRICS, decode_row
+
+    for line in reversed(last_lines(ledger.folder / METRICS, 2)):  # the last may be half written
+        row = decode_row(line.encode() + b"\n")
+        if row is not None and isinstance(row.get("steps"), int):
+            return int(row["steps"])
+    return 0
 
 
 def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: str) -> Table:
