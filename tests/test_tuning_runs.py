@@ -61,8 +61,9 @@ def test_trials_train_and_are_told(left_alone: tuple[Path, Grid]) -> None:
 def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: tuple[Path, Grid], tmp_path: Path) -> None:
     """SIGKILL to the command and all that it has started; other numbers of workers each time."""
     path, undisturbed = left_alone
-    root, moments, killed = tmp_path / "runs", random.Random(0), 0
-    for attempt in range(4 * KILLS):
+    moments, killed, searches = random.Random(0), 0, 1
+    for attempt in range(6 * KILLS):
+        root = tmp_path / str(searches)
         command = [sys.executable, "-m", "space_dist.cli", "tune", "run", path, "--root", root,
                    "--max-parallel", str(1 + attempt % 3)]  # fmt: skip
         process = subprocess.Popen(command, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
@@ -72,14 +73,18 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: tuple[
             before = progress(root)
             while process.poll() is None and progress(root) - before < wanted and time.monotonic() < deadline:
                 time.sleep(0.02)
-            if process.poll() is not None:
-                break
-            killed += 1
+            ended = process.poll()
         finally:
             end_session(process)
-    assert killed == KILLS
-    assert process.returncode == 0
-    assert (root / "search/manifest.json").read_bytes() == undisturbed.manifest_file.read_bytes()
+        if ended is None:
+            killed += 1
+            continue
+        assert ended == 0
+        assert (root / "search/manifest.json").read_bytes() == undisturbed.manifest_file.read_bytes()
+        if killed >= KILLS:
+            return
+        searches += 1  # it came to its end before it was killed so often: another one
+    pytest.fail(f"{killed} kills, and no search came to its end behind them")
 
 
 def progress(root: Path) -> int:
