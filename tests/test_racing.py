@@ -37,12 +37,14 @@ RESULTS = (METRICS, CURRICULUM, "model.npz")
 
 
 def racing_tune(folder: Path, **sections: Any) -> Path:
-    return tiny_tune(folder, SET, **{"generation": 4, "pruner": RUNGS, **sections})
+    changes = {**SET, **sections.pop("set", {})}
+    return tiny_tune(folder, changes, **{"generation": 4, "pruner": RUNGS, **sections})
 
 
 def population_tune(folder: Path, **sections: Any) -> Path:
     without = {"generation": None, "sampler": None, "search": {"learner.learning_rate": RATE}, "arms": KAPPAS}
-    return tiny_tune(folder, SET, **{**without, "population": POPULATION, **sections})
+    changes = {**SET, **sections.pop("set", {})}
+    return tiny_tune(folder, changes, **{**without, "population": POPULATION, **sections})
 
 
 @pytest.fixture(scope="module")
@@ -246,7 +248,9 @@ def test_every_search_of_the_repository_can_be_planned(path: Path, tmp_path: Pat
     ("sections", "words"),
     [
         ({"pruner": {"rungs": [{"seeds": 1, "steps": 300}]}}, "compared at 300 steps"),
-        ({"pruner": {"rungs": [{"steps": BUDGET}]}}, "fewer than budget.steps = 1,024"),
+        ({"pruner": {"rungs": [{"steps": BUDGET}]}}, "no room for another round of 256 within budget.steps = 1,024"),
+        ({"set": {"budget.steps": 1100, "evaluation.every_steps": 100}, "pruner": {"rungs": [{"steps": 1000}]}},
+         "no room for another round"),
         ({"pruner": {"rungs": [{"seeds": 2}]}}, "pruner.rungs"),  # of two: that is the end
         ({"pruner": {"rungs": [{}]}}, "pruner.rungs"),
         ({"pruner": {"rungs": [{"seeds": 2, "steps": 256}, {"seeds": 1, "steps": 512}]}}, "of none of them less"),
@@ -255,7 +259,7 @@ def test_every_search_of_the_repository_can_be_planned(path: Path, tmp_path: Pat
         ({"pruner": {"rungs": [{"seed": 1}]}}, "did you mean 'seeds'"),
         ({"pruner": {"rungs": []}}, "pruner.rungs"),
     ],
-)
+)  # fmt: skip
 def test_rungs_at_which_nothing_can_be_compared_are_refused(
     sections: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
@@ -272,6 +276,8 @@ def test_rungs_at_which_nothing_can_be_compared_are_refused(
         ({"population": {**POPULATION, "factors": []}}, "population.factors"),
         ({"population": {**POPULATION, "factors": [0.0]}}, "population.factors"),
         ({"population": {}}, "population.every_steps"),
+        ({"set": {"budget.episodes": 50}}, "budget.episodes, may have ended before"),
+        ({"arms": {"a": {"set": {"curriculum": {"kind": "learnability", "top": 2}}}}}, "whose curriculum probes"),
         ({"pruner": {"rungs": [1]}}, "pruner says nothing with population"),
         ({"generation": 2}, "generation says nothing with population"),
         ({"sampler": {"kind": "random"}}, "sampler says nothing with population"),

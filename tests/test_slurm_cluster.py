@@ -289,21 +289,26 @@ def test_an_array_survives_preemption_and_its_time_limit(
         await_(lambda node=node: slurm.left_on(node) == [], f"n{node} to be clean", folder)
 
 
-@executes(("slurm.md", 0))
-def test_what_the_page_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> None:
-    """Its block, on configs in small and with a profile of this Slurm; what it submits is held, and taken back."""
-    write_small_configs(tmp_path / "configs")
-    (tmp_path / "configs/slurm/site.yaml").write_text(to_yaml({"mem": 1500, "temp": "/var/tmp"}))  # noqa: S108
-    [script] = bash_blocks("slurm.md")
-    for old, new in (("/shared", f"{tmp_path}/shared"), ("submit.sh ", "submit.sh --hold "),
-                     ("\nspace-dist grid status", "\nspace-dist grid status --json")):  # fmt: skip
+def typed(script: str, status: str, slurm: Slurm, folder: Path) -> subprocess.CompletedProcess[str]:
+    """What became of a page's block in an empty folder: configs in small, jobs held, and the status as JSON."""
+    write_small_configs(folder / "configs")
+    (folder / "configs/slurm/site.yaml").write_text(to_yaml({"mem": 1500, "temp": "/var/tmp"}))  # noqa: S108
+    for old, new in (("/shared", f"{folder}/shared"), ("submit.sh ", "submit.sh --hold "),
+                     (f"\nspace-dist {status}", f"\nspace-dist {status} --json")):  # fmt: skip
         assert old in script
         script = script.replace(old, new)
     command = f"{sys.executable} -P -m space_dist.cli"
-    done = subprocess.run(
+    return subprocess.run(
         ["bash", "-c", f'set -e\nspace-dist() {{ {command} "$@" || [ $? = 3 ]; }}\n{script}'],
-        cwd=tmp_path, env=slurm.environment, capture_output=True, text=True, timeout=PATIENCE,
+        cwd=folder, env=slurm.environment, capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
+
+
+@executes(("slurm.md", 0))
+def test_what_the_page_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> None:
+    """Its block, on configs in small and with a profile of this Slurm; what it submits is held, and taken back."""
+    [script] = bash_blocks("slurm.md")
+    done = typed(script, "grid status", slurm, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "sbatch --test-only: no objection" in done.stdout
     told = json.loads(done.stdout[done.stdout.index("{") :])
@@ -317,18 +322,7 @@ def test_what_the_page_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> No
 @executes(("tuning.md", 1))
 def test_what_the_page_of_searches_has_one_type_is_taken(slurm: Slurm, tmp_path: Path) -> None:
     """Its block, in small; of what it submits nothing begins to train."""
-    write_small_configs(tmp_path / "configs")
-    (tmp_path / "configs/slurm/site.yaml").write_text(to_yaml({"mem": 1500, "temp": "/var/tmp"}))  # noqa: S108
-    script = bash_blocks("tuning.md")[1]
-    for old, new in (("/shared", f"{tmp_path}/shared"), ("submit.sh ", "submit.sh --hold "),
-                     ("\nspace-dist tune status", "\nspace-dist tune status --json")):  # fmt: skip
-        assert old in script
-        script = script.replace(old, new)
-    command = f"{sys.executable} -P -m space_dist.cli"
-    done = subprocess.run(
-        ["bash", "-c", f'set -e\nspace-dist() {{ {command} "$@" || [ $? = 3 ]; }}\n{script}'],
-        cwd=tmp_path, env=slurm.environment, capture_output=True, text=True, timeout=PATIENCE,
-    )  # fmt: skip
+    done = typed(bash_blocks("tuning.md")[1], "tune status", slurm, tmp_path)
     slurm.ask("scancel", "--user=root")
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(done.stdout[done.stdout.index("{") :])

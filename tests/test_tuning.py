@@ -496,12 +496,12 @@ def test_objectives_are_the_reports_statistics(tmp_path: Path) -> None:
     # 4 is reached at 1000, 2000, never (censored at 4000), and 2000.
     assert over_seeds(runs, Objective(kind="steps", threshold=4.0), 4000) == pytest.approx(9000 / 4)
     assert math.isnan(over_seeds(runs, Objective(kind="worst"), 4000))  # one episode each: there are no halves
-    # As they were at 2000 steps: 4, 4, 0 and 4; areas 3, 1, 0 and 1. Nobody was evaluated behind 4000.
+    # As they were at 2000 steps: 4, 4, 0 and 4; areas 3, 1, 0 and 1.
     early = [run.until(1500) for run in runs]
     assert all(run.evaluation_steps[-1] == 2000 for run in early)
     assert over_seeds(early, Objective(kind="final"), 2000) == 4.0
     assert over_seeds(early, Objective(kind="area"), 2000) == pytest.approx(1.0)
-    assert not any(run.until(4001).finished for run in runs)
+    assert all(run.until(4001) is run for run in runs)  # they ended before
     unfinished = start_run(tmp_path / "more", seed=7)
     continue_run(unfinished, [0.0, 1.0], [[0]], state="failed")
     assert math.isnan(over_seeds([*runs, load_run(unfinished)], Objective(), 4000))

@@ -112,7 +112,7 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
             shown = f"{evaluations[-1]['test']['return']:.1f}" if evaluations else "—"
             steps = rows[-1]["steps"] if rows else 0
             size = len(rows[-1]["trained"]) if rows else 0
-            line = f"{steps:>10,} of {run.cell.budget_steps:,} steps   set {size}   test return {shown}"
+            line = f"{steps:>10,} of {run.cell.steps_to_take:,} steps   set {size}   test return {shown}"
         table.add_row(Text(run.title), Text(line))
     if len(overview.running) > _SHOWN_RUNS:
         table.add_row("", Text(f"and {len(overview.running) - _SHOWN_RUNS} more"))

@@ -233,11 +233,23 @@ class _Planned:
         key = "pruner.rungs" if self.config.population is None else "population.every_steps"
         every, budget = config.evaluation.every_steps, config.budget.steps
         *rungs, _ = self.config.rungs(budget)
+        if self.config.population is not None and (config.budget.episodes is not None or config.curriculum.may_probe):
+            raise ConfigError(
+                "population: its runs must all come to every comparison, and one whose curriculum probes, or that has "
+                "budget.episodes, may have ended before"
+            )
+        horizon = self._specs[config.env.model_dump_json()].horizon
+        round_steps = config.round_steps(horizon)
         for rung in rungs:
-            if rung.steps >= budget or (rung.steps and next_evaluation(every, rung.steps - 1) != rung.steps):
+            if -(-rung.steps // round_steps) * round_steps + round_steps > budget:
                 raise ConfigError(
-                    f"{key}: trials cannot be compared at {rung.steps:,} steps: these must be fewer than budget.steps "
-                    f"= {budget:,}, and steps of an evaluation (evaluation.every_steps: {every})"
+                    f"{key}: {rung.steps:,} steps leave no room for another round of {round_steps:,} within "
+                    f"budget.steps = {budget:,}: runs have ended by then, and nothing is left to race for"
+                )
+            if rung.steps and next_evaluation(every, rung.steps - 1) != rung.steps:
+                raise ConfigError(
+                    f"{key}: trials cannot be compared at {rung.steps:,} steps: these must be steps of an "
+                    f"evaluation (evaluation.every_steps: {every})"
                 )
         if self.config.population is not None and not rungs:
             raise ConfigError(f"{key} must be less than budget.steps = {budget:,}, or nobody is ever copied")

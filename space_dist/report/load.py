@@ -55,11 +55,14 @@ class Run:
     def until(self, steps: int) -> Run:
         """The run as if its budget had ended with the first evaluation at or behind so many steps.
 
-        It is unfinished where it was not evaluated so late. What is read anew from the ledger, but for `final_halves`,
+        It stays as it is where it has ended before that, and is unfinished where it was not evaluated so late. What is
+        read anew from the ledger, but for `final_halves`,
         is the whole run's.
         """
         at = int(np.searchsorted(self.evaluation_steps, steps))
         if at == len(self.evaluation_steps):
+            if self.finished:
+                return self
             return replace(self, status=replace(self.status, state="interrupted"))
         end = int(self.evaluation_steps[at])
         complete = self.iteration_ends <= end
