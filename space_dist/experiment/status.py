@@ -152,8 +152,8 @@ class RunStatus:
     condition: `waiting` runs will be started, or go on, when somebody works on the grid; `failed` ones will not.
     cause, detail: of the last attempt's end, if it has not been done since.
     steps, budget_steps: environment steps, and those that it is to take for now. attempts: how many began.
-    other_code: done, but by another version of this package than the one here. end_recorded, supervised: of a run that is done, whether the end of its last attempt
-    is written, and whether its supervisor lives that would write it.
+    other_code: done, but by another version of this package than the one here. end_recorded, supervised: of a run that
+    is done, whether the end of its last attempt is written, and whether its supervisor lives that would write it.
     """
 
     run: Run
