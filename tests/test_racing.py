@@ -178,7 +178,13 @@ def test_what_a_population_found_is_confirmed_as_a_schedule(evolved: tuple[Path,
         assert ("schedule:" in text) == (best.parent >= 0)
         found += best.parent >= 0
     assert found
+    assert "space-dist tune confirm" in build_search_report(grid, tmp_path / "before").summary[1]
+    whole = grid.folder / "confirm/search-confirm.yaml"
+    command = [sys.executable, "-m", "space_dist.cli", "grid", "run", whole, "--root", tmp_path]
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, timeout=PATIENCE).returncode == 0
     made = build_search_report(grid, tmp_path / "report")
+    assert "All 2 runs are finished" in made.summary[1]
+    assert "; from 256 steps learner.learning_rate: " in made.markdown or "; from 512 steps" in made.markdown
     # Each of the four places of an arm has two seeds, trained to the end once.
     assert f"{4 * 2 * BUDGET:,}" in made.markdown
     assert "4/4 + 3 heirs" in made.markdown

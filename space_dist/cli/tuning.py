@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
+from rich import box
 from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
@@ -213,7 +214,9 @@ def _search_of(place: Grid, manifest: Manifest) -> Search:
 def _summary(manifest: Manifest, search: Search) -> str:
     counts = Counter(trial.state for trial in search.trials)
     parts = [f"{count} {state}" for state, count in sorted(counts.items())]
-    return f"{manifest.name}: {search.asked} of {search.total} trials asked: {', '.join(parts)}"
+    heirs = len(search.trials) - search.asked
+    asked = f"{search.asked} of {search.total} trials asked" + (f", and {heirs} heirs" if heirs else "")
+    return f"{manifest.name}: {asked}: {', '.join(parts)}"
 
 
 def _print_trials(search: Search, cells: list[str]) -> None:
@@ -222,13 +225,13 @@ def _print_trials(search: Search, cells: list[str]) -> None:
         {
             "arm": trial.arm, "trial": str(trial.number), "from": str(trial.parent) if trial.parent >= 0 else "",
             "state": trial.state, "seeds": str(trial.seeds), "steps": f"{trial.steps:,}" if trial.steps else "",
-            "setting": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in trial.parameters.items()),
+            "setting": "\n".join(f"{key.rpartition('.')[2]}={value}" for key, value in trial.parameters.items()),
         }
         for trial in search.trials if trial.cell in cells
     ]  # fmt: skip
     # Of whom it is a copy, and where its runs are paused, is told where there is any such trial.
     told = [key for key in (rows[0] if rows else ()) if any(row[key] for row in rows)]
-    table = Table(title_justify="left")
+    table = Table(title_justify="left", box=box.SIMPLE)  # numbers are read whole at 80 columns
     for column in told:
         is_number = column in ("trial", "from", "seeds", "steps")
         table.add_column(column, justify="right" if is_number else "left", overflow="fold")

@@ -138,6 +138,15 @@ class Search:
             found.insert(0, of_arm[found[0].parent])
         return tuple(found)
 
+    def in_force(self, trial: Trial) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
+        """The settings that a trial began with, and how they changed on the way: a config's `schedule`."""
+        first, *later = self.lineage(trial)
+        # An heir's generation is the number of the comparison at which it was copied.
+        return first.parameters, [
+            {"steps": int(self.config["population"]["every_steps"]) * heir.generation, "set": dict(heir.parameters)}
+            for heir in later
+        ]
+
     def best(self, arm: str) -> Trial | None:
         """The complete trial of an arm with the best objective, the first of equal ones; None: there is none."""
         complete = [(trial.value, trial) for trial in self.of_arm(arm)]

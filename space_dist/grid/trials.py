@@ -232,7 +232,7 @@ def _heirs(
         heir = Trial(
             number, parent.arm, parent.rung, setting, "", seeds, steps, rung=parent.rung + 1, parent=parent.number
         )
-        first, schedule = in_force(search.with_trials([*search.trials, *heirs, heir]), heir, rungs)
+        first, schedule = search.with_trials([*search.trials, *heirs, heir]).in_force(heir)
         try:
             cell = _cell(manifest, search, parent.arm, number, first, schedule, where, grid, files, specs)
         except ConfigError as error:
@@ -243,18 +243,6 @@ def _heirs(
         cells.setdefault(cell.id, cell)
         heirs.append(dataclasses.replace(heir, cell=cell.id, inherited=inherited))
     return [*cells.values()], heirs
-
-
-def in_force(
-    search: Search, trial: Trial, rungs: Sequence[Rung]
-) -> tuple[Mapping[str, Any], list[Mapping[str, Any]]]:  # fmt: skip
-    """The settings that a trial began with, and how they changed on the way: a config's `schedule`."""
-    first, *later = search.lineage(trial)
-    # An heir's generation is the number of the rung at which it was copied.
-    schedule: list[Mapping[str, Any]] = [
-        {"steps": rungs[heir.generation - 1].steps, "set": dict(heir.parameters)} for heir in later
-    ]
-    return first.parameters, schedule
 
 
 def _measured(grid: Grid, manifest: Manifest, trial: Trial, failed: tuple[int, str] | None) -> Trial:

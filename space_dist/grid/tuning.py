@@ -37,7 +37,7 @@ from space_dist.experiment.tuning import (
 )
 from space_dist.grid.conductor import freeze
 from space_dist.grid.planning import InstanceFiles, frozen_cell, resolved_cell
-from space_dist.grid.trials import asked, in_force, rungs_of, with_settings
+from space_dist.grid.trials import asked, with_settings
 from space_dist.instances import InstanceSet, refuse_overlap, repeats
 from space_dist.run.building import Blueprint
 from space_dist.run.training import next_evaluation
@@ -309,7 +309,7 @@ def confirmation(grid: Grid, manifest: Manifest) -> Path:
         best = search.best(arm)
         if best is None:
             raise ConfigError(f"arm {arm} has nothing to confirm: none of its {config.trials} trials is complete")
-        first, schedule = in_force(search, best, rungs_of(search))
+        first, schedule = search.in_force(best)
         data = with_settings(with_settings(record.base, first), config.confirm.set)
         if schedule:
             data["schedule"] = schedule

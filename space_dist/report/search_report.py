@@ -144,7 +144,7 @@ def _arms(grid: Grid, manifest: Manifest, search: Search) -> list[dict[str, str]
                 **{state: str(counts[state]) for state in ("complete", "pruned", "failed")},
                 "environment steps": f"{_steps_of(trials, steps):,}",
                 "chosen": NONE if best is None else f"trial {best.number}",
-                "setting": NONE if best is None else _setting(best),
+                "setting": NONE if best is None else _course_of(search, best),
             }
         )
     return rows
@@ -156,8 +156,14 @@ def _steps_of(trials: Sequence[Trial], steps: Mapping[str, int]) -> int:
     return sum(steps[cell] - trial.inherited for cell, trial in by_cell.items() if cell in steps)
 
 
-def _setting(trial: Trial) -> str:
-    return ", ".join(f"{key}: {_word(value)}" for key, value in trial.parameters.items())
+def _course_of(search: Search, trial: Trial) -> str:
+    """Its settings, one after the other where they changed on the way."""
+    first, schedule = search.in_force(trial)
+    return "; ".join([_setting(first), *(f"from {one['steps']:,} steps {_setting(one['set'])}" for one in schedule)])
+
+
+def _setting(parameters: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key}: {_word(value)}" for key, value in parameters.items())
 
 
 def _word(value: Any) -> str:
@@ -229,7 +235,7 @@ def _failed(search: Search) -> list[Section]:
     found = [trial for trial in search.trials if trial.state == "failed"]
     if not found:
         return []
-    rows = [{"trial": f"{trial.arm} {trial.number}", "why": trial.remark, "setting": _setting(trial)}
+    rows = [{"trial": f"{trial.arm} {trial.number}", "why": trial.remark, "setting": _setting(trial.parameters)}
             for trial in found[:MAX_LISTED]]  # fmt: skip
     text = [f"The first {MAX_LISTED} of {len(found)}; trials.csv has all."] if len(found) > MAX_LISTED else []
     return [Section("Failed trials", text, rows, words=True)]
@@ -299,7 +305,9 @@ def _not_of_this(found: Manifest, manifest: Manifest, search: Search) -> str:
         return "has other arms than the search"
     for arm, cell in cells.items():
         best = search.best(arm)
-        if best is None or any(not _same(cell, key, value) for key, value in best.parameters.items()):
+        first, schedule = ({}, []) if best is None else search.in_force(best)
+        same = all(_same(cell, key, value) for key, value in first.items())
+        if best is None or not same or list(cell.config.get("schedule", ())) != schedule:
             return f"has another setting of {arm} than the search has chosen"
         if dict(cell.config["instances"]) != dict(search.final):
             return "has other instances than confirm.instances names"
