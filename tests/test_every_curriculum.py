@@ -43,6 +43,12 @@ KINDS = {
     "learnability": "{kind: learnability, top: 2, every: 2, episodes: 2}",
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
+    "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -1, smoothing: 0.5}",
+    "plr_max_mc": "{kind: plr, score: max_mc}",
+    "plr_robust": "{kind: plr, robust: true, temperature: 1, within_update: fixed_chances}",
+    "currot": "{kind: currot, delta: 0.5, particles: 12}",
+    "currot_bounds": "{kind: currot, delta: 0.5, particles: 12, over: bounds, target: normal, target_mean: [1, 0],"
+    " target_std: [0.1, 1]}",
     "manual": "{kind: manual, column: effort}",
 }
 

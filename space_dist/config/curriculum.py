@@ -256,11 +256,7 @@ class SelfPacedConfig(_Curriculum):
 
     @model_validator(mode="after")
     def _whole_target(self) -> Self:
-        given = (self.target_mean is not None, self.target_std is not None)
-        if self.target == "normal" and not all(given):
-            raise ValueError("target: normal needs target_mean and target_std")
-        if self.target == "set_moments" and any(given):
-            raise ValueError("target_mean and target_std say nothing with target: set_moments; use target: normal")
+        _refuse_half_a_target(self.target, self.target_mean, self.target_std)
         return self
 
     @property
@@ -338,7 +334,10 @@ class AlpGmmConfig(_Curriculum):
 
 
 class LevelReplayConfig(_Curriculum):
-    """Prioritised level replay (Jiang et al. 2021): by rank of mean |GAE|, and by how long ago. On-policy learners."""
+    """Prioritised level replay (Jiang et al. 2021): by rank of a score, and by how long ago.
+
+    On-policy learners; with score: max_mc and without robust, any.
+    """
 
     kind: Literal["plr"]
     """Which curriculum: prioritised level replay."""
@@ -350,6 +349,18 @@ class LevelReplayConfig(_Curriculum):
     """How the episodes of one update are drawn, between which no score can change. without_repetition: what was drawn
     leaves the ranking until everything else was. fixed_chances: the paper's chances as they stand, by which one
     instance has nearly all episodes of an update. Source: ours; Jiang et al. 2021, who decide before each episode."""
+    score: Literal["value_l1", "max_mc"] = "value_l1"
+    """What instances are ranked by. value_l1: mean |GAE| of the episodes. max_mc: the highest discounted return that an
+    episode on it had so far, minus its start value. Source: Jiang et al. 2021; Jiang et al. 2021, "Replay-Guided
+    Adversarial Environment Design", whose value estimates are of all steps of an episode."""
+    robust: bool = False
+    """Learn from replayed instances only: rounds of uniform draws over the set are played and scored, charged to the
+    budget, and not learned from. Source: the same (robust PLR)."""
+    replay_share: float = Field(default=0.5, gt=0.0, le=1.0)
+    """Of robust: the chance that an iteration replays, once enough was scored. Source: the authors' code (0.5)."""
+    scored_share: float = Field(default=0.5, gt=0.0, le=1.0)
+    """Of robust: the share of the set that must have been scored before anything is replayed. Source: the authors' code
+    (0.5)."""
 
 
 class LearnabilityConfig(_Curriculum):
@@ -389,8 +400,8 @@ class ProximalConfig(_Curriculum):
     kind: Literal["procurl"]
     """Which curriculum: ProCuRL."""
     score: Literal["zone", "improvement"] = "zone"
-    """zone: p (1 - p). improvement: by how much the value has risen in the last iteration (its authors' control
-    `space-alt`). Source: Tzannetos et al. 2023."""
+    """zone: p (1 - p). improvement: by how much the value has risen in the last iteration, which is the control that
+    its authors call `space-alt`. Source: Tzannetos et al. 2023."""
     beta: float = Field(default=20.0, gt=0.0)
     """Inverse temperature of the softmax. Source: the authors' code (20)."""
     scale: Literal["largest", "set"] = "largest"
@@ -403,6 +414,83 @@ class ProximalConfig(_Curriculum):
     def ranks_by_start_value(self) -> bool:
         """See `_Curriculum`."""
         return True
+
+
+class LearningProgressConfig(_Curriculum):
+    """Bidirectional learning progress (Kanitscheider et al. 2021): instances whose success rate rises or falls.
+
+    No probes: rates are those of the training episodes.
+    """
+
+    kind: Literal["learning_progress"]
+    """Which curriculum: bidirectional learning progress."""
+    outcome: Literal["success", "return"] = "success"
+    """What an episode counts as. success: 1 or 0, as the environment says. return: its return, from 0 at lowest_return
+    to 1 at largest_return, cut off at both ends. Source: Kanitscheider et al. 2021; ours."""
+    lowest_return: float = 0.0
+    """Of outcome: return: what counts as 0, in reward units."""
+    largest_return: float = 1.0
+    """Of outcome: return: what counts as 1, in reward units."""
+    smoothing: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Weight of the new in both averages: the fast one is of rates, the slow one of the fast one. Source: OMNI's code
+    (0.1)."""
+    theta: float = Field(default=0.1, gt=0.0, lt=1.0)
+    """Rates p are reweighed as (1 - theta) p / (p + theta (1 - 2 p)), which makes much of changes near 0: theta itself
+    becomes 1 / 2. Source: Kanitscheider et al. 2021 (0.1)."""
+    uniform_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Share of draws from all instances: what always failed is tried by these alone. Source: Syllabus, where rates are
+    those of training episodes as well (0.25)."""
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if self.lowest_return >= self.largest_return:
+            raise ValueError(
+                f"lowest_return: {self.lowest_return:g} must be below largest_return: {self.largest_return:g}"
+            )
+        return self
+
+
+class TransportConfig(_Curriculum):
+    """CURROT (Klink et al. 2022): contexts that move to a target as far as their expected return stays high enough.
+
+    No probes, no values: expected returns are those of the episodes on contexts nearby.
+    """
+
+    kind: Literal["currot"]
+    """Which curriculum: CURROT."""
+    delta: float
+    """The performance that contexts must be expected to reach, in reward units. Source: Klink et al. 2022, who choose
+    one for each environment (their point mass: 4)."""
+    performance: Literal["discounted_return", "return"] = "discounted_return"
+    """What delta is compared with. Source: the authors' code (both)."""
+    over: Literal["set", "bounds"] = "set"
+    """set: the training instance nearest to a context. bounds: the context itself, generated within the environment's
+    bounds. Source: ours; Klink et al. 2022."""
+    target: Literal["set", "normal"] = "set"
+    """What contexts move to. set: the training instances. normal: target_mean and target_std. Source: ours; Klink et
+    al. 2022."""
+    target_mean: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=MAX_LIST, strict=False)
+    """With target: normal, its mean, one number a feature, in environment units."""
+    target_std: tuple[Annotated[float, Field(gt=0.0)], ...] | None = Field(
+        default=None, min_length=1, max_length=MAX_LIST, strict=False
+    )
+    """With target: normal, its standard deviations, in environment units."""
+    epsilon: float = Field(default=0.1, gt=0.0)
+    """Trust region: how far a context moves in one iteration, where each feature's bounds are 0 and 1. Source: the
+    authors' point mass, whose 0.7 are a tenth of the width of its bounds."""
+    particles: int = Field(default=100, ge=2, le=1000)
+    """Contexts that move, and episodes that are remembered: as many that reached delta, and as many others. Source: the
+    authors' point mass (100)."""
+
+    @model_validator(mode="after")
+    def _target_is_whole(self) -> Self:
+        _refuse_half_a_target(self.target, self.target_mean, self.target_std)
+        return self
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """See `_Curriculum`."""
+        return ("scipy",)
 
 
 class CustomConfig(_Curriculum):
@@ -446,6 +534,14 @@ class CustomConfig(_Curriculum):
         return (self.import_path,)
 
 
+def _refuse_half_a_target(target: str, mean: tuple[float, ...] | None, std: tuple[float, ...] | None) -> None:
+    given = (mean is not None, std is not None)
+    if target == "normal" and not all(given):
+        raise ValueError("target: normal needs target_mean and target_std")
+    if target != "normal" and any(given):
+        raise ValueError(f"target_mean and target_std say nothing with target: {target}; use target: normal")
+
+
 CurriculumConfig = Annotated[
     SpaceConfig
     | RoundRobinConfig
@@ -460,6 +556,8 @@ CurriculumConfig = Annotated[
     | LevelReplayConfig
     | LearnabilityConfig
     | ProximalConfig
+    | LearningProgressConfig
+    | TransportConfig
     | CustomConfig,
     Field(discriminator="kind"),
 ]

@@ -14,6 +14,7 @@ from space_dist.config import (
     CustomConfig,
     FixedConfig,
     LearnabilityConfig,
+    LearningProgressConfig,
     LevelReplayConfig,
     ManualConfig,
     ProximalConfig,
@@ -21,17 +22,20 @@ from space_dist.config import (
     RoundRobinConfig,
     SelfPacedConfig,
     SpaceConfig,
+    TransportConfig,
     UniformConfig,
     ValueDisagreementConfig,
 )
 from space_dist.curricula import variants
 from space_dist.curricula.alp_gmm import AlpGmm
+from space_dist.curricula.currot import Transport
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
 from space_dist.curricula.gaussian import Gaussian
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
-from space_dist.curricula.plr import LevelReplay
+from space_dist.curricula.learning_progress import LearningProgress
+from space_dist.curricula.plr import LevelReplay, Robust
 from space_dist.curricula.procurl import Proximal
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
@@ -68,6 +72,8 @@ class Makers:
             LevelReplayConfig: self._level_replay,
             LearnabilityConfig: self._learnability,
             ProximalConfig: self._proximal,
+            LearningProgressConfig: self._learning_progress,
+            TransportConfig: self._transport,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -143,7 +149,8 @@ class Makers:
     def _level_replay(self, settings: LevelReplayConfig) -> LevelReplay:
         return LevelReplay(
             self._train, seed=self._seed, draws=self._draws, temperature=settings.temperature,
-            staleness_share=settings.staleness_share, within_update=settings.within_update,
+            staleness_share=settings.staleness_share, within_update=settings.within_update, score=settings.score,
+            robust=Robust(settings.replay_share, settings.scored_share) if settings.robust else None,
         )  # fmt: skip
 
     def _learnability(self, settings: LearnabilityConfig) -> Learnability:
@@ -162,6 +169,21 @@ class Makers:
             scale=settings.scale, largest=settings.largest_return,
         )  # fmt: skip
 
+    def _learning_progress(self, settings: LearningProgressConfig) -> LearningProgress:
+        return LearningProgress(
+            self._train, seed=self._seed, draws=self._draws, outcome=settings.outcome, lowest=settings.lowest_return,
+            largest=settings.largest_return, smoothing=settings.smoothing, theta=settings.theta,
+            uniform_share=settings.uniform_share,
+        )  # fmt: skip
+
+    def _transport(self, settings: TransportConfig) -> Transport:
+        return Transport(
+            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, from_set=settings.over == "set",
+            target=None if settings.target == "set" else self._normal(settings), delta=settings.delta,
+            discounted=settings.performance == "discounted_return", epsilon=settings.epsilon,
+            particles=settings.particles,
+        )  # fmt: skip
+
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
         bounds = self._bounds
         middle, width = (bounds.low + bounds.high) / 2.0, bounds.high - bounds.low
@@ -169,13 +191,7 @@ class Makers:
             self._features("initial_mean", settings.initial_mean, bounds, middle),
             self._features("initial_std", settings.initial_std, bounds, width / 4.0),
         )
-        if settings.target == "set_moments":
-            target = self._set_moments()
-        else:
-            target = Gaussian.of(
-                self._features("target_mean", settings.target_mean, bounds, middle),
-                self._features("target_std", settings.target_std, bounds, width),
-            )
+        target = self._set_moments() if settings.target == "set_moments" else self._normal(settings)
         least = settings.least_std
         return SelfPaced(
             seed=self._seed, draws=self._draws, bounds=bounds, initial=initial, target=target,
@@ -183,6 +199,13 @@ class Makers:
             optimiser=settings.optimiser, least_std_until=settings.least_std_until,
             least_std=None if least is None else self._features("least_std", least, bounds, width),
         )  # fmt: skip
+
+    def _normal(self, settings: SelfPacedConfig | TransportConfig) -> Gaussian:
+        bounds = self._bounds
+        return Gaussian.of(
+            self._features("target_mean", settings.target_mean, bounds, (bounds.low + bounds.high) / 2.0),
+            self._features("target_std", settings.target_std, bounds, bounds.high - bounds.low),
+        )
 
     def _set_moments(self) -> Gaussian:
         contexts = self._train.contexts

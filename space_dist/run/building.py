@@ -224,7 +224,14 @@ class Blueprint:
                 f"{config.learner.kind} does not compute. Allowed learners: "
                 f"{', '.join(learners_that('has_advantages'))}"
             )
-        if curriculum.wants.probes and not self.spec.knows_success(curriculum.start()[1].contexts[:1]):
+        if curriculum.wants.unlearned and not config.learner.has_advantages:
+            raise ConfigError(
+                f"curriculum.kind: {kind}, as it is set, plays rounds that are not learned from, and learner.kind: "
+                f"{config.learner.kind} learns from what it remembers. Allowed learners: "
+                f"{', '.join(learners_that('has_advantages'))}"
+            )
+        asks_success = curriculum.wants.probes or curriculum.wants.success
+        if asks_success and not self.spec.knows_success(curriculum.start()[1].contexts[:1]):
             raise ConfigError(
                 f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} "
                 "does not say (its steps have no `success`)"

@@ -22,6 +22,7 @@ from space_dist.rollout.walk import Walk
 from space_dist.system.workplace import cores
 
 _WORTH_RAY = 100_000  # environment steps: at some thousand a second, several times what it takes to start Ray
+_SILENT = "curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say"
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
 
@@ -147,6 +148,9 @@ class CurriculumHost:
             version, before, after, gradient_steps, ensemble=ensemble,
             episodes=next(self._valued(seen, after), None), probes=self._probed(state, seen),
         )  # fmt: skip
+        episodes = feedback.episodes
+        if self.curriculum.wants.success and episodes is not None and np.isnan(episodes.success).any():
+            raise ConfigError(_SILENT)
         new, selection, numbers = self.curriculum.step(state, feedback)
         return new, selection, numbers, after
 
@@ -166,7 +170,7 @@ class CurriculumHost:
         outcomes = joined(parts)
         # `Blueprint` has asked one instance's first step only.
         if np.isnan(outcomes.success).any():
-            raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")
+            raise ConfigError(_SILENT)
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
 
 

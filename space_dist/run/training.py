@@ -3,7 +3,7 @@
     select   curriculum.start()                          one instance (SPaCE), all (round robin), ...
     repeat
         collect  cluster.collect(policy, selection, walk)  exactly n_steps transitions, in shards; episodes go on
-        update   learner.update(shards)                  SB3's own train()
+        update   learner.update(shards)                  SB3's own train(); none where the selection says so
         until the selection was passed over once at full horizon (draws: after one update), then
         revalue  cluster.start_values(policy)            V(s0, c) of every instance, straight to the curriculum
         select   cluster.decide(state, evidence)         the next selection, from that and what else was asked for
@@ -180,7 +180,10 @@ class Training:
             self._arrived(shards, lag=1 if acted else 0)
             run.acted = self._look_ahead(policy)
             # Line 5, with SB3's own `train()`.
-            update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted or None)
+            if asked.trained is None or asked.trained.learned:
+                update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted or None)
+            else:
+                update = self.learner.look_at(shards, round=run.round - 1, acted=acted or None)
             self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             # Lines 6 to 13.

@@ -96,7 +96,18 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_LEAN, "budget.steps=640", "curriculum.fit_rate=12", "curriculum.components=3",
     ]),
     "plr": ("curricula/pointmass_plr", _LEAN),
+    "plr robust": ("curricula/pointmass_plr_robust", [
+        *_LEAN, "budget.steps=1024", "curriculum.replay_share=0.7",
+    ]),
     "procurl": ("sparse_pointmass_procurl", _LEAN),
+    "procurl space-alt": ("curricula/pointmass_space_alt", _LEAN),
+    "learning_progress": ("curricula/pointmass_learning_progress", [*_LEAN, "budget.steps=512"]),
+    "currot": ("curricula/pointmass_currot", [
+        *_LEAN, "budget.steps=512", "curriculum.delta=0.5", "curriculum.particles=16",
+    ]),
+    "currot over the set": ("curricula/pointmass_currot", [
+        *_LEAN, "budget.steps=512", _curriculum("kind: currot, delta: 0.5, particles: 16"),
+    ]),
     "learnability": ("cartpole_dqn_space", [
         *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
         "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024",
