@@ -478,7 +478,7 @@ class TransportConfig(_Curriculum):
     epsilon: float = Field(default=0.1, gt=0.0)
     """Trust region: how far a context moves in one iteration, where each feature's bounds are 0 and 1. Source: the
     authors' point mass, whose 0.7 are a tenth of the width of its bounds."""
-    particles: int = Field(default=100, ge=2, le=1000)
+    particles: int = Field(default=100, ge=2, le=500)
     """Contexts that move, and episodes that are remembered: as many that reached delta, and as many others. Source: the
     authors' point mass (100)."""
 
