@@ -155,7 +155,8 @@ class Transport(Curriculum):
             return self._to_cube(np.clip(self._target.sample(random, self._count), low, high))
         n = len(self._contexts)
         rest = random.choice(n, size=self._count % n, replace=False)
-        return self._contexts[np.concatenate([np.tile(np.arange(n), self._count // n), rest])]
+        samples: FloatArray = self._contexts[np.concatenate([np.tile(np.arange(n), self._count // n), rest])]
+        return samples
 
     def _to_cube(self, contexts: FloatArray) -> FloatArray:
         return (self._bounds.scale(contexts) + 1.0) / 2.0

@@ -164,8 +164,8 @@ class LevelReplay(Drawn):
         unseen = np.flatnonzero((state.last < 0) & ~runs)
         unseen = unseen[np.argsort(self._ties[unseen], kind="stable")][:count]
         if self._explores(state):
-            random = generator(self._seed, Purpose.DRAWS, state.version)
-            return np.concatenate([unseen, random.integers(len(state.last), size=count)])[:count]
+            any_of_them = generator(self._seed, Purpose.DRAWS, state.version).integers(len(state.last), size=count)
+            return np.concatenate([unseen, any_of_them])[:count]
         if self._robust is not None:
             unseen = unseen[:0]  # what was never scored is none of what is learned from
         if self._within_update == "fixed_chances":
