@@ -101,12 +101,15 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ]),
     "procurl": ("sparse_pointmass_procurl", _LEAN),
     "procurl space-alt": ("curricula/pointmass_space_alt", _LEAN),
-    "learning_progress": ("curricula/pointmass_learning_progress", [*_LEAN, "budget.steps=512"]),
+    "learning_progress": ("curricula/pointmass_learning_progress", [
+        *_LEAN, "budget.steps=512", "curriculum.outcome=return", "curriculum.lowest_return=0.25",
+        "curriculum.largest_return=0.4",
+    ]),
     "currot": ("curricula/pointmass_currot", [
-        *_LEAN, "budget.steps=512", "curriculum.delta=0.5", "curriculum.particles=16",
+        *_LEAN, "budget.steps=512", "curriculum.delta=0.253", "curriculum.particles=16",
     ]),
     "currot over the set": ("curricula/pointmass_currot", [
-        *_LEAN, "budget.steps=512", _curriculum("kind: currot, delta: 0.5, particles: 16"),
+        *_LEAN, "budget.steps=512", _curriculum("kind: currot, delta: 0.253, particles: 16"),
     ]),
     "learnability": ("cartpole_dqn_space", [
         *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
