@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,20 +25,22 @@ from space_dist.config import (
     ValueDisagreementConfig,
 )
 from space_dist.curricula import variants
-from space_dist.curricula.alp_gmm import AlpGmm
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
-from space_dist.curricula.gaussian import Gaussian
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
 from space_dist.curricula.plr import LevelReplay
 from space_dist.curricula.procurl import Proximal
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
-from space_dist.curricula.spdrl import SelfPaced
 from space_dist.curricula.vds import ValueDisagreement
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
+
+if TYPE_CHECKING:  # SciPy takes half a second to import, and few curricula need it
+    from space_dist.curricula.alp_gmm import AlpGmm
+    from space_dist.curricula.gaussian import Gaussian
+    from space_dist.curricula.spdrl import SelfPaced
 
 
 class Makers:
@@ -134,6 +136,8 @@ class Makers:
         return ValueDisagreement(self._train, seed=self._seed, draws=self._draws)
 
     def _alp_gmm(self, settings: AlpGmmConfig) -> AlpGmm:
+        from space_dist.curricula.alp_gmm import AlpGmm
+
         return AlpGmm(
             self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, from_set=settings.over == "set",
             random_share=settings.random_share, fit_rate=settings.fit_rate, history=settings.history,
@@ -163,6 +167,9 @@ class Makers:
         )  # fmt: skip
 
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
+        from space_dist.curricula.gaussian import Gaussian
+        from space_dist.curricula.spdrl import SelfPaced
+
         bounds = self._bounds
         middle, width = (bounds.low + bounds.high) / 2.0, bounds.high - bounds.low
         initial = Gaussian.of(
@@ -185,6 +192,8 @@ class Makers:
         )  # fmt: skip
 
     def _set_moments(self) -> Gaussian:
+        from space_dist.curricula.gaussian import Gaussian
+
         contexts = self._train.contexts
         # ddof=0: the set is the whole of what is aimed at, and no sample of it.
         covariance = np.atleast_2d(np.cov(contexts, rowvar=False, ddof=0)) if len(contexts) > 1 else None

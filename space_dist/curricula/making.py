@@ -13,7 +13,7 @@ def make_curriculum(config: RunConfig, train: InstanceSet, bounds: ContextBounds
 
     bounds: of the contexts of the config's environment.
     """
-    from space_dist.curricula.configured import Makers  # SciPy's optimisers, which rollout actors never need
+    from space_dist.curricula.configured import Makers  # every curriculum, which rollout actors never need
 
     rollout = config.rollout
     return Makers(
