@@ -18,6 +18,7 @@ from space_dist.config import (
     ManualConfig,
     ProximalConfig,
     RandomGrowthConfig,
+    ReplayConfig,
     RoundRobinConfig,
     SelfPacedConfig,
     SpaceConfig,
@@ -31,6 +32,7 @@ from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
 from space_dist.curricula.plr import LevelReplay
 from space_dist.curricula.procurl import Proximal
+from space_dist.curricula.replay import Recording, Replay
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
 from space_dist.curricula.vds import ValueDisagreement
@@ -49,9 +51,14 @@ class Makers:
     train: the instance set, and `source` the file it came from.
     draws: how many a round can use.
     bounds: of the contexts of the environment.
+    recorded: what another run was trained on, for who follows it.
     """
 
-    def __init__(self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds) -> None:
+    def __init__(
+        self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds,
+        recorded: bytes | None = None,
+    ) -> None:  # fmt: skip
+        self._recorded = recorded
         self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
 
     def make(self, settings: CurriculumConfig) -> Curriculum:
@@ -70,6 +77,7 @@ class Makers:
             LevelReplayConfig: self._level_replay,
             LearnabilityConfig: self._learnability,
             ProximalConfig: self._proximal,
+            ReplayConfig: self._replay,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -165,6 +173,22 @@ class Makers:
             self._train, seed=self._seed, draws=self._draws, beta=settings.beta, score=settings.score,
             scale=settings.scale, largest=settings.largest_return,
         )  # fmt: skip
+
+    def _replay(self, settings: ReplayConfig) -> Replay:
+        if self._recorded is None:
+            raise ConfigError("curriculum.kind: replay follows the curriculum of a run, which this is none of")
+        try:
+            recording = Recording.decode(self._recorded)
+        except ValueError as error:
+            raise ConfigError(f"curriculum.of: {settings.of} holds no recorded curriculum: {error}") from None
+        strangers = recording.strangers(self._train)
+        if len(strangers):
+            more = f" (and {len(strangers) - 1} more)" if len(strangers) > 1 else ""
+            raise ConfigError(
+                f"curriculum.of: {settings.of} was trained on instance {strangers[0]}{more}, which {self._source} does "
+                "not have, or with another context: who follows a run needs its instances"
+            )
+        return Replay(self._train, recording, draws=self._draws)
 
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
         from space_dist.curricula.gaussian import Gaussian
