@@ -75,13 +75,15 @@ def evenness(episodes: IntArray, sizes: FloatArray) -> FloatArray:
     each = np.where(played, sizes / np.maximum(episodes, 1), 0.0)
     total, squares = each.sum(axis=1), (each**2).sum(axis=1)
     found: FloatArray = np.full(len(each), np.nan)
-    return np.divide(total**2, played.sum(axis=1) * squares, out=found, where=squares > 0.0)
+    np.divide(total**2, played.sum(axis=1) * squares, out=found, where=squares > 0.0)
+    return found
 
 
 def _mean(values: FloatArray, counted: NDArray[np.bool_]) -> FloatArray:
     count = counted.sum(axis=1)
     found: FloatArray = np.full(len(values), np.nan)
-    return np.divide(np.where(counted, values, 0.0).sum(axis=1), count, out=found, where=count > 0)
+    np.divide(np.where(counted, values, 0.0).sum(axis=1), count, out=found, where=count > 0)
+    return found
 
 
 def measured(states: list[WatchedState], steps: int) -> Headroom:
