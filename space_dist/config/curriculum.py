@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -493,6 +494,16 @@ class TransportConfig(_Curriculum):
         return ("scipy",)
 
 
+class ReplayConfig(_Curriculum):
+    """What another run was trained on, iteration after iteration: a *yoked* control, which adapts to nothing."""
+
+    kind: Literal["replay"]
+    """Which curriculum: another run's, replayed."""
+    of: Path = Field(strict=False)
+    """Folder of that run, which must be done, with a budget not smaller than this one's. A relative path is relative to
+    this config file. It counts by its content, of which the run keeps a copy."""
+
+
 class CustomConfig(_Curriculum):
     """A curriculum of your own: any that keeps the protocol (docs/your_curriculum.md)."""
 
@@ -558,6 +569,7 @@ CurriculumConfig = Annotated[
     | ProximalConfig
     | LearningProgressConfig
     | TransportConfig
+    | ReplayConfig
     | CustomConfig,
     Field(discriminator="kind"),
 ]
