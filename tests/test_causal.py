@@ -35,6 +35,10 @@ KINDS = {
     "plr": "{kind: plr}",
     "spdrl": "{kind: spdrl, warm_up: 1, offset: 0}",
     "vds": "{kind: vds, n_batches: 1, batch_size: 50}",
+    "procurl": "{kind: procurl, score: improvement, scale: set}",
+    "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: 0.25, largest_return: 0.5}",
+    "plr_robust": "{kind: plr, robust: true, score: max_mc, scored_share: 0.3, temperature: 1}",
+    "currot": "{kind: currot, delta: 0.3, particles: 16, over: bounds}",
 }
 
 
@@ -287,6 +291,16 @@ def test_continuations_are_the_run_until_they_part(sets: Path, of: Any, tmp_path
         assert Ledger(tmp_path / name).rows(METRICS)[-1]["steps"] == BUDGET
         models.add(found["model.npz"])
     assert len(models) == 4
+
+
+@pytest.mark.parametrize("kind", ["procurl", "learning_progress", "plr_robust", "currot"])
+def test_draws_are_gone_on_with_behind_a_fork(kind: str, sets: Path, of: Any, tmp_path: Path) -> None:
+    trunk = of(kind)
+    same = run(forked(sets, KINDS[kind], None, seed=0), tmp_path / "same")
+    assert same == {name: (trunk / name).read_bytes() for name in RESULTS}
+    other = run(forked(sets, KINDS[kind], None, seed=1), tmp_path / "other")
+    assert rows_until(tmp_path / "other", AT) == rows_until(trunk, AT)
+    assert other["model.npz"] != same["model.npz"]
 
 
 @pytest.mark.parametrize("change", KINDS)
