@@ -19,7 +19,7 @@ from tests.config_texts import leaves
 from tests.test_config import SHIPPED, SPACE, ident, kinds, plain, written
 
 # What a kind cannot do without.
-NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"},
+NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"}, "currot": {"delta": 4.0},
                           "custom": {"import": "my_package.my_module:Mine"}, "replay": {"of": "runs/a/s0"}}  # fmt: skip
 CONFIGS = {path.stem: load(path) for path in SHIPPED}
 CONFIGS |= {f"{section}_{kind}": load(SPACE, [f"{section}={json.dumps({'kind': kind, **NEEDED.get(kind, {})})}"])
