@@ -44,6 +44,7 @@ KINDS = {
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
     "manual": "{kind: manual, column: effort}",
+    "watched": "{kind: watched, iterations: 4, shares: 2}",
 }
 
 

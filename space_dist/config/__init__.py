@@ -30,6 +30,7 @@ from space_dist.config.curriculum import (
     SpaceConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.config.explaining import schema
 from space_dist.config.identities import NOT_IDENTITY, changes, differences, flattened, identity
@@ -116,6 +117,7 @@ __all__ = [
     "TrackingConfig",
     "UniformConfig",
     "ValueDisagreementConfig",
+    "WatchedConfig",
     "about_shipped",
     "apply_override",
     "beside",

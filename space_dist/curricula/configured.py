@@ -24,6 +24,7 @@ from space_dist.config import (
     SpaceConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.curricula import variants
 from space_dist.curricula.custom import Custom, make_custom
@@ -36,6 +37,7 @@ from space_dist.curricula.replay import Recording, Replay
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
 from space_dist.curricula.vds import ValueDisagreement
+from space_dist.curricula.watching import Watched
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
 
@@ -78,6 +80,7 @@ class Makers:
             LearnabilityConfig: self._learnability,
             ProximalConfig: self._proximal,
             ReplayConfig: self._replay,
+            WatchedConfig: self._watched,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -172,6 +175,12 @@ class Makers:
         return Proximal(
             self._train, seed=self._seed, draws=self._draws, beta=settings.beta, score=settings.score,
             scale=settings.scale, largest=settings.largest_return,
+        )  # fmt: skip
+
+    def _watched(self, settings: WatchedConfig) -> Watched:
+        return Watched(
+            self._train, seed=self._seed, draws=self._draws, iterations=settings.iterations, shares=settings.shares,
+            advantages=settings.advantages,
         )  # fmt: skip
 
     def _replay(self, settings: ReplayConfig) -> Replay:
