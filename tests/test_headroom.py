@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from space_dist.api.headroom import measure_headroom
 from space_dist.curricula import Draws
 from space_dist.curricula.watching import Watched, WatchedState
 from space_dist.errors import ConfigError
 from space_dist.report.headroom import evenness, in_words, measured, signal, table, verdict
+from tests.shell import bash_blocks
 from tests.test_rivals import feedback, instances
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -133,6 +136,28 @@ def test_the_command_measures(tmp_path: Path) -> None:
     assert again.returncode == 0, again.stderr
     assert " ".join(found["words"]) in " ".join(again.stdout.split())
     assert (tmp_path / "out/instances.csv").read_bytes() == kept
+
+
+def test_the_page_is_typed_from_its_first_block_to_its_last(tmp_path: Path) -> None:
+    """In small: budgets, seeds and where it forks; all else as it stands."""
+    configs_of = tmp_path / "configs"
+    (configs_of / "instances").mkdir(parents=True)
+    for name in ("sparse_pointmass_round_robin", "sparse_pointmass_procurl"):
+        data = yaml.safe_load((ROOT / f"configs/{name}.yaml").read_text())
+        data["budget"]["steps"], data["evaluation"]["every_steps"], data["tracking"] = 8192, 8192, {"uri": None}
+        (configs_of / f"{name}.yaml").write_text(yaml.safe_dump(data))
+        for path in data["instances"].values():
+            shutil.copy(ROOT / "configs" / path, configs_of / path)
+    script = "\n".join(bash_blocks("causes.md")).replace("100000", "4096").replace("200000", "8192")
+    assert script.count("space-dist ") == 6
+    ours = f'space-dist() {{ {sys.executable} -m space_dist.cli "$@"; }}\n'
+    done = subprocess.run(["bash", "-euo", "pipefail", "-c", ours + script.replace("--seeds 5", "--seeds 2")],
+                          cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "Uniform draws gave" in done.stdout or "Nothing succeeded" in done.stdout
+    assert "6 runs, bit for bit the same" in " ".join(done.stdout.split())
+    assert (tmp_path / "runs/yoked/recorded.npz").exists()
+    assert (tmp_path / "runs/sparse_pointmass_procurl_s0_from_4096/report/report.md").exists()
 
 
 def test_learners_without_advantages_have_outcomes(tmp_path: Path) -> None:
