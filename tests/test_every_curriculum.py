@@ -50,6 +50,7 @@ KINDS = {
     "currot_bounds": "{kind: currot, delta: 0.5, particles: 12, over: bounds, target: normal, target_mean: [1, 0],"
     " target_std: [0.1, 1]}",
     "manual": "{kind: manual, column: effort}",
+    "watched": "{kind: watched, iterations: 4, shares: 2}",
 }
 
 

@@ -20,7 +20,8 @@ from tests.test_config import SHIPPED, SPACE, ident, kinds, plain, written
 
 # What a kind cannot do without.
 NEEDED: dict[str, Any] = {"fixed": {"count": 4}, "manual": {"column": "difficulty"}, "currot": {"delta": 4.0},
-                          "custom": {"import": "my_package.my_module:Mine"}, "replay": {"of": "runs/a/s0"}}  # fmt: skip
+                          "custom": {"import": "my_package.my_module:Mine"}, "replay": {"of": "runs/a/s0"},
+                          "watched": {"iterations": 5}}  # fmt: skip
 CONFIGS = {path.stem: load(path) for path in SHIPPED}
 CONFIGS |= {f"{section}_{kind}": load(SPACE, [f"{section}={json.dumps({'kind': kind, **NEEDED.get(kind, {})})}"])
             for section in ("learner", "curriculum") for kind in kinds(section)}  # fmt: skip

@@ -86,8 +86,8 @@ def _watched(config: RunConfig, steps: int | None) -> Blueprint:
         # Decided when the grid is frozen: a config that names an update keeps it.
         "engine": "auto" if config.engine == "single" and not config.learner.is_compiled("single") else config.engine,
         "curriculum": {
-            "kind": "custom", "import": "space_dist.curricula.watching:Watched",
-            "kwargs": {"iterations": max(1, iterations), "shares": shares, "advantages": config.learner.has_advantages},
+            "kind": "watched", "iterations": max(1, iterations), "shares": shares,
+            "advantages": config.learner.has_advantages,
         },
         "budget": {**data["budget"], "steps": budget, "episodes": None},
         "schedule": [], "fork": None,

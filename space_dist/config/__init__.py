@@ -32,6 +32,7 @@ from space_dist.config.curriculum import (
     TransportConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.config.explaining import schema
 from space_dist.config.identities import NOT_IDENTITY, changes, differences, flattened, identity
@@ -120,6 +121,7 @@ __all__ = [
     "TransportConfig",
     "UniformConfig",
     "ValueDisagreementConfig",
+    "WatchedConfig",
     "about_shipped",
     "apply_override",
     "beside",

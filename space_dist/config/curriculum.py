@@ -494,6 +494,19 @@ class TransportConfig(_Curriculum):
         return ("scipy",)
 
 
+class WatchedConfig(_Curriculum):
+    """Uniform draws that also count what every instance shows over time: what `space-dist headroom` measures with."""
+
+    kind: Literal["watched"]
+    """Which curriculum: uniform draws, watched."""
+    iterations: int = Field(ge=1, le=10_000_000)
+    """Of the whole run."""
+    shares: int = Field(default=10, ge=1, le=1000)
+    """Into which these are cut."""
+    advantages: bool = True
+    """Whether the sizes of advantages are counted, which on-policy learners have."""
+
+
 class ReplayConfig(_Curriculum):
     """What another run was trained on, iteration after iteration: a *yoked* control, which adapts to nothing."""
 
@@ -570,6 +583,7 @@ CurriculumConfig = Annotated[
     | LearningProgressConfig
     | TransportConfig
     | ReplayConfig
+    | WatchedConfig
     | CustomConfig,
     Field(discriminator="kind"),
 ]

@@ -26,6 +26,7 @@ from space_dist.config import (
     TransportConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.curricula import variants
 from space_dist.curricula.custom import Custom, make_custom
@@ -39,6 +40,7 @@ from space_dist.curricula.replay import Recording, Replay
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
 from space_dist.curricula.vds import ValueDisagreement
+from space_dist.curricula.watching import Watched
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
 
@@ -84,6 +86,7 @@ class Makers:
             LearningProgressConfig: self._learning_progress,
             TransportConfig: self._transport,
             ReplayConfig: self._replay,
+            WatchedConfig: self._watched,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -196,6 +199,12 @@ class Makers:
             target=None if settings.target == "set" else self._normal(settings), delta=settings.delta,
             discounted=settings.performance == "discounted_return", epsilon=settings.epsilon,
             particles=settings.particles,
+        )  # fmt: skip
+
+    def _watched(self, settings: WatchedConfig) -> Watched:
+        return Watched(
+            self._train, seed=self._seed, draws=self._draws, iterations=settings.iterations, shares=settings.shares,
+            advantages=settings.advantages,
         )  # fmt: skip
 
     def _replay(self, settings: ReplayConfig) -> Replay:

@@ -18,12 +18,15 @@ class WatchedState(DrawnState):
     episodes, successes: (w, n) training episodes that ended, and how many of these succeeded, of which there are none
         where the environment knows no success.
     sizes: (w, n) sums over these episodes of their mean |GAE|; 0 for learners without advantages.
+    failed, every: (2,) least and greatest return of the episodes that did not succeed, and of all; infinite before any.
     knows_success: whether every episode said whether it succeeded.
     """
 
     episodes: IntArray
     successes: IntArray
     sizes: FloatArray
+    failed: FloatArray
+    every: FloatArray
     knows_success: bool
 
 
@@ -47,7 +50,8 @@ class Watched(Uniform):
         drawn, selection = super().start()
         shape = (self._shares, len(self._instances))
         none = np.zeros(shape, dtype=np.int64)
-        return WatchedState(drawn.version, drawn.chances, none, none, np.zeros(shape), True), selection
+        empty = np.array([np.inf, -np.inf])
+        return WatchedState(drawn.version, drawn.chances, none, none, np.zeros(shape), empty, empty, True), selection
 
     def step(self, state: DrawnState, feedback: Feedback) -> tuple[WatchedState, Selection, Numbers]:
         """The same chances; what the iteration's episodes showed is added to what was known."""
@@ -62,6 +66,12 @@ class Watched(Uniform):
             sizes[share] += np.bincount(seen.indices, weights=seen.advantages, minlength=n)
         new = WatchedState(
             state.version + 1, state.chances, episodes, successes, sizes,
+            _widened(state.failed, seen.returns[seen.success != 1.0]), _widened(state.every, seen.returns),
             state.knows_success and not bool(np.isnan(seen.success).any()),
         )  # fmt: skip
         return new, self.selection(new), self._numbers(feedback, new.chances)
+
+
+def _widened(span: FloatArray, values: FloatArray) -> FloatArray:
+    """(2,) least and greatest of what was known and of more values."""
+    return np.array([values.min(initial=span[0]), values.max(initial=span[1])])

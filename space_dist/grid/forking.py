@@ -42,7 +42,7 @@ def forked(run: Path, steps: int, overrides: Sequence[str], seeds: int, out: Pat
     branches = [before]
     whole = config.model_dump(mode="json")
     for override in overrides:
-        branches.append(_with_change(before, steps, _change(override)))
+        branches.append(_with_change(before, steps, change_of(override)))
         configs.parse({**whole, "schedule": branches[-1]}, f"{run} with {configs.told(override)}")
     first = _FIRST_SEED if not _FIRST_SEED <= config.seed < _FIRST_SEED + seeds else config.seed + 1
     grid = {
@@ -58,7 +58,7 @@ def forked(run: Path, steps: int, overrides: Sequence[str], seeds: int, out: Pat
     return len(branches) * seeds
 
 
-def _change(override: str) -> dict[str, Any]:
+def change_of(override: str) -> dict[str, Any]:
     """What `KEY=VALUE` changes; `curriculum.kind=K`, and `curriculum={kind: K, ...}`, put another in its place."""
     data: dict[str, Any] = {}
     configs.apply_override(data, override)

@@ -9,12 +9,15 @@ instances can save more, as long as what it learns on one is worth no more on an
 
 **Evenness.** Where there is no success, or none that is all or nothing: (sum of s)^2 / (n * sum of s^2), with s an
 instance's mean |GAE|. 1: all teach alike, and there is nothing to choose; 1/n: one teaches all.
+
+Where episodes that fail are paid differently (a dense reward), they teach as well, however few succeed: then evenness
+decides, and the signal of outcomes bounds nothing.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +29,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LITTLE: Final = 0.5  # signal or evenness below which there is much to choose
+ALIKE: Final = 0.01  # of the span of all returns: failures that differ by less are paid alike
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,8 @@ class Headroom:
     steps: of one run.  signal: `(s, w)`, NaN where no instance had two episodes or success is not known.  evenness:
     `(s, w)`, NaN without advantages.  solved: `(s, w)` share of episodes that succeeded.  never, always: `(s, w)` share
     of the instances with episodes of which none, or each, succeeded.  first: `(s,)` steps by the end of the share in
-    which the first success fell; NaN: there was none.
+    which the first success fell; NaN: there was none.  failures: least and greatest return of an episode that failed,
+    where these are not all alike: then failures teach.
     """
 
     steps: int
@@ -45,6 +50,7 @@ class Headroom:
     never: FloatArray
     always: FloatArray
     first: FloatArray
+    failures: tuple[float, float] | None = None
 
     def over_all(self, measure: FloatArray) -> Interval:
         """Its mean over time, IQM over seeds; a share of time that has no such number is left out."""
@@ -89,32 +95,49 @@ def _mean(values: FloatArray, counted: NDArray[np.bool_]) -> FloatArray:
 def measured(states: list[WatchedState], steps: int) -> Headroom:
     """The headroom that runs of so many steps each showed."""
     rows = [_of_run(state, steps) for state in states]
-    arrays = [np.array([row[place] for row in rows]) for place in range(len(rows[0]))]
-    return Headroom(steps, *arrays)
+    arrays: dict[str, FloatArray] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return Headroom(steps=steps, failures=_failures(states), **arrays)
 
 
-def _of_run(state: WatchedState, steps: int) -> tuple[FloatArray | float, ...]:
+def _failures(states: list[WatchedState]) -> tuple[float, float] | None:
+    """Least and greatest return of a failure, where failures are not paid alike and success is known."""
+    low, high = min(state.failed[0] for state in states), max(state.failed[1] for state in states)
+    span = max(state.every[1] for state in states) - min(state.every[0] for state in states)
+    known = all(state.knows_success for state in states)
+    return (float(low), float(high)) if known and high - low > ALIKE * span else None
+
+
+def _of_run(state: WatchedState, steps: int) -> dict[str, Any]:
     episodes, successes = state.episodes, state.successes
     unknown = np.full(len(episodes), np.nan)
     played = episodes > 0
     uneven = evenness(episodes, state.sizes)
     if not state.knows_success:
-        return unknown, uneven, unknown, unknown, unknown, float("nan")
+        nothing = dict.fromkeys(("signal", "solved", "never", "always"), unknown)
+        return {**nothing, "evenness": uneven, "first": float("nan")}
     won = np.flatnonzero(successes.any(axis=1))
     first = (won[0] + 1) * steps / len(episodes) if len(won) else float("nan")
-    return (
-        signal(episodes, successes), uneven,
-        np.divide(successes.sum(axis=1), episodes.sum(axis=1), out=unknown.copy(), where=played.any(axis=1)),
-        _mean((successes == 0).astype(np.float64), played), _mean((successes == episodes).astype(np.float64), played),
-        first,
-    )  # fmt: skip
+    return {
+        "signal": signal(episodes, successes),
+        "evenness": uneven,
+        "solved": np.divide(successes.sum(axis=1), episodes.sum(axis=1), out=unknown.copy(), where=played.any(axis=1)),
+        "never": _mean((successes == 0).astype(np.float64), played),
+        "always": _mean((successes == episodes).astype(np.float64), played),
+        "first": first,
+    }
 
 
 def in_words(found: Headroom) -> list[str]:
     """What it means, in sentences."""
     seeds = len(found.first)
     told = []
-    if np.isnan(found.signal).all():
+    if found.failures is not None:
+        low, high = found.failures
+        told.append(
+            f"Episodes that fail have returns from {low:.3g} to {high:.3g} here, so they teach as well, however few "
+            "succeed: the signal of outcomes bounds nothing."
+        )
+    elif np.isnan(found.signal).all():
         told.append("Whether an episode succeeds is not known here, so only the sizes of advantages can tell.")
     else:
         missed = int(np.isnan(found.first).sum())
@@ -147,7 +170,8 @@ def in_words(found: Headroom) -> list[str]:
 
 def verdict(found: Headroom) -> str:
     """One sentence: whether to expect anything of a curriculum."""
-    known = found.signal if not np.isnan(found.signal).all() else found.evenness
+    by_outcome = found.failures is None and not np.isnan(found.signal).all()
+    known = found.signal if by_outcome else found.evenness
     if np.isnan(known).all():
         return "Neither success nor advantages are known: nothing can be said."
     share = found.over_all(known).value

@@ -36,7 +36,7 @@ def draw_headroom(found: Headroom, states: Sequence[WatchedState]) -> Figure:
     left.set_ylim(0.0, 1.02)
     left.set_ylabel("share of what the best draws would give")
     dress(left, "What uniform draws teach", over_steps=True)
-    left.legend(fontsize=8, loc="upper right")
+    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     if known:
         episodes = np.sum([state.episodes for state in states], axis=0)
         successes = np.sum([state.successes for state in states], axis=0)
@@ -50,4 +50,5 @@ def draw_headroom(found: Headroom, states: Sequence[WatchedState]) -> Figure:
         figure.colorbar(image, ax=axes, label="success rate of training episodes")
         axes.set_ylabel("instances, by how often they succeed")
         dress(axes, "Which instances succeed when", over_steps=True)
+        axes.grid(visible=False)
     return figure
