@@ -13,28 +13,32 @@ Each imports from those below it.
 from __future__ import annotations
 
 from space_dist.config.curriculum import (
-    AlpGmmConfig,
-    ContextSpaceConfig,
     CurriculumConfig,
     CustomConfig,
-    FixedConfig,
-    GrowingConfig,
+    ReplayConfig,
+    WatchedConfig,
+)
+from space_dist.config.drawing import (
+    AlpGmmConfig,
     LearnabilityConfig,
     LearningProgressConfig,
     LevelReplayConfig,
-    ManualConfig,
     ProximalConfig,
-    RandomGrowthConfig,
-    ReplayConfig,
-    RoundRobinConfig,
     SelfPacedConfig,
-    SpaceConfig,
     TransportConfig,
     UniformConfig,
     ValueDisagreementConfig,
-    WatchedConfig,
 )
 from space_dist.config.explaining import schema
+from space_dist.config.growing import (
+    ContextSpaceConfig,
+    FixedConfig,
+    GrowingConfig,
+    ManualConfig,
+    RandomGrowthConfig,
+    RoundRobinConfig,
+    SpaceConfig,
+)
 from space_dist.config.identities import NOT_IDENTITY, changes, differences, flattened, identity
 from space_dist.config.learner import (
     A2CConfig,
