@@ -77,7 +77,7 @@ def test_it_walks_as_the_facts_say(compiled: bool) -> None:
         assert np.array_equal(step.terminated, step.success)
         assert np.array_equal(step.truncated, (time >= 200) & ~step.success)
         at_walls += int((np.abs(places) == 7.0).any(axis=1).sum())
-        at_block += int(((np.abs(places).max(axis=1) == 5.0)).sum())
+        at_block += int((np.abs(places).max(axis=1) == 5.0).sum())
         arrivals += int(step.success.sum())
         assert not (np.abs(places) < 5.0 - 1e-9).all(axis=1).any()
     assert min(at_walls, at_block, arrivals) > 50

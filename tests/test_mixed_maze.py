@@ -59,7 +59,7 @@ def test_the_larger_sets_are_what_is_drawn_perfect_and_disjoint() -> None:
     for one in kept:
         sides = one.contexts[:, 0].astype(int)
         assert {*sides} == set(range(3, 12))
-        assert np.bincount(sides)[3:].min() >= 0.05 * len(one)
+        assert np.bincount(sides)[3:].min() >= 0.03 * len(one)  # 3x3: repeats were drawn again
         for context, side in zip(one.contexts, sides.tolist(), strict=True):
             ways = search(context)
             assert set(ways) == {(x, y) for x in range(side) for y in range(side)}

@@ -137,10 +137,10 @@ def test_nobody_gets_through_a_closed_gate(compiled: bool) -> None:
     seen = env.reset(np.arange(len(contexts)), contexts, np.arange(len(contexts), dtype=np.uint64))
     crashed = np.zeros(len(contexts), dtype=np.bool_)
     for _ in range(100):
-        at_gate = np.abs(seen[:, 0] - contexts[:, 0]) < 0.02
-        actions = np.column_stack((np.clip(3.0 * (contexts[:, 0] - seen[:, 0]) - 1.5 * seen[:, 1], -1.0, 1.0),
-                                   np.where(at_gate | (contexts[:, 0] == 4.0), -0.5, 0.0)))  # fmt: skip
-        actions[0, 0] = 1.0
+        aside = contexts[:, 0] - seen[:, 0]
+        down = np.where((np.abs(aside) < 0.1) & (np.abs(seen[:, 1]) < 0.5), -0.3, 0.2 * (3.0 - seen[:, 2] - seen[:, 3]))
+        actions = np.clip(np.column_stack((0.5 * aside - 0.3 * seen[:, 1], down)), -1.0, 1.0)
+        actions[0] = [1.0, -0.5]
         step = env.step(actions)
         seen = np.where(crashed[:, None], seen, step.observations)
         crashed |= step.terminated
@@ -223,7 +223,7 @@ def test_what_a_users_environment_draws_is_looked_at(env_id: str, kwargs: dict[s
 
 def test_worlds_without_unsolvable_instances_are_named() -> None:
     train = sample("cartpole_uniform", 10, 5, 0)[0]
-    with pytest.raises(ConfigError, match="env.id 'space_dist/CartPole-v0' knows of no unsolvable instances"):
+    with pytest.raises(ConfigError, match=r"env\.id 'space_dist/CartPole-v0' knows of no unsolvable instances"):
         pad(train, 0.5, 0, "space_dist/CartPole-v0", {})
 
 

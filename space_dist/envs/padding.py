@@ -46,8 +46,7 @@ def pad(instances: InstanceSet, share: float, seed: int, env_id: str, kwargs: Ma
     try:
         if instances.names != env.context_bounds.names:
             raise ConfigError(
-                f"the set's features are {_listed(instances)}, not {_listed(env.context_bounds)}, "
-                f"those of {where}"
+                f"the set's features are {_listed(instances)}, not {_listed(env.context_bounds)}, those of {where}"
             )
         drawn = _distinct(where, _drawing(where, env), env.context_bounds, instances, count, seed)
     finally:
