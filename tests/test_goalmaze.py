@@ -138,21 +138,29 @@ def test_the_distributions_are_those_of_the_paper() -> None:
         assert {*drawn[:, 2]} == {0.05}
     np.testing.assert_allclose(uniform.mean(axis=0), [0.0, 0.0, 9.025], atol=0.15)
     assert (np.ptp(uniform, axis=0) > 0.99 * (BOUNDS.high - BOUNDS.low)).all()
+    graded, solvable = (sample(f"goalmaze_{name}", 20_000, 1, 0)[0].contexts for name in ("graded", "solvable"))
+    thirds = np.histogram(np.log(graded[:, 2]), bins=3, range=(math.log(0.05), math.log(18.0)))[0]
+    assert np.abs(thirds / 20_000 - 1 / 3).max() < 0.02
+    assert abs(reachable(graded).mean() - 0.65) < 0.015
+    assert reachable(solvable).all()
 
 
 def test_the_larger_sets_are_what_is_drawn_and_share_nothing() -> None:
     kept = {}
-    for name in ("uniform", "target", "feasible"):
+    for name in ("uniform", "target", "graded", "solvable", "feasible"):
         for split, drawn in zip(("train", "test"), sample(f"goalmaze_{name}", 1000, 200, 0), strict=True):
             path = INSTANCES / f"goalmaze_{name}_1000_{split}.csv"
             if path.exists():
                 assert path.read_text() == drawn.to_csv()
                 kept[name, split] = read_csv(path, BOUNDS)
-    assert {("uniform", "train"), ("uniform", "test"), ("target", "train"), ("feasible", "test")} == set(kept)
-    for name in ("uniform", "target"):
-        for tested in ("uniform", "feasible"):
+    trains, tests = ("uniform", "target", "graded"), ("solvable", "feasible")
+    assert {*kept} == {*((name, "train") for name in trains), *((name, "test") for name in tests)}
+    for name in trains:
+        for tested in tests:
             refuse_overlap(kept[name, "train"], kept[tested, "test"], "train", "test")
             assert not {*kept[name, "train"].ids} & {*kept[tested, "test"].ids}
+    assert all(reachable(kept[name, "test"].contexts).all() for name in tests)
+    assert 0.6 < reachable(kept["graded", "train"].contexts).mean() < 0.7
 
 
 @pytest.mark.parametrize("n_slots", [1, 3, 17])

@@ -22,13 +22,13 @@ WALL: Final = 7.0  # |x| and |y| at most: the outer walls
 BLOCK: Final = 5.0  # nobody is where both |x| and |y| are less
 STRIDE: Final = 0.3  # length of the longest step
 START_LOW, START_HIGH = -7.0, -5.0  # of both coordinates: the lower left corner
-TOLERANCE: Final = 0.05  # of the target's goals
+TOLERANCE, WIDEST = 0.05, 18.0  # the least, that of the target's goals, and the greatest
 HORIZON: Final = 200
 
 BOUNDS: Final = ContextBounds(
     names=("goal_x", "goal_y", "tolerance"),
     low=np.array([-9.0, -9.0, TOLERANCE]),
-    high=np.array([9.0, 9.0, 18.0]),
+    high=np.array([9.0, 9.0, WIDEST]),
 )
 """Goal maze (Klink et al. 2022): the goal, and how far from it is near enough, in the world's length units."""
 
@@ -56,6 +56,19 @@ def _draw_target(rng: np.random.Generator, n: int) -> FloatArray:
     drawn = _draw_uniform(rng, n)
     drawn[:, 2] = TOLERANCE
     return drawn
+
+
+def _draw_graded(rng: np.random.Generator, n: int) -> FloatArray:
+    """Goals anywhere; tolerances of every order of magnitude as likely."""
+    drawn = _draw_uniform(rng, n)
+    share = (drawn[:, 2] - TOLERANCE) / (WIDEST - TOLERANCE)
+    drawn[:, 2] = np.clip(TOLERANCE * (WIDEST / TOLERANCE) ** share, TOLERANCE, WIDEST)
+    return drawn
+
+
+def _draw_solvable(rng: np.random.Generator, n: int) -> FloatArray:
+    """As graded, but for those whose goal cannot be reached."""
+    return _those(rng, n, _draw_graded, reachable)
 
 
 def _draw_feasible(rng: np.random.Generator, n: int) -> FloatArray:
@@ -87,6 +100,19 @@ DISTRIBUTIONS: Final = {
         source="Klink et al. 2022 (the target distribution)",
         bounds=BOUNDS,
         draw=_draw_target,
+    ),
+    "goalmaze_graded": Distribution(
+        description="Goal maze, goals uniform within their bounds, tolerance log-uniform within its own: 35 % of the "
+        "goals cannot be reached",
+        source="Klink et al. 2022 (the bounds); the tolerances are ours",
+        bounds=BOUNDS,
+        draw=_draw_graded,
+    ),
+    "goalmaze_solvable": Distribution(
+        description="Goal maze, as goalmaze_graded, but for the goals that cannot be reached",
+        source="Klink et al. 2022 (the bounds); the tolerances are ours",
+        bounds=BOUNDS,
+        draw=_draw_solvable,
     ),
     "goalmaze_feasible": Distribution(
         description="Goal maze, goals uniform in the corridor; tolerance 0.05",
