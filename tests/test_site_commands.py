@@ -132,9 +132,7 @@ def test_installing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (shell.folder / "my_configs/grids/quickstart.yaml").is_file()
 
 
-@executes(
-    ("environments.md", 0), ("environments.md", 1), ("environments.md", 2), ("environments.md", 3), ("environments.md", 6)
-)  # fmt: skip
+@executes(*(("environments.md", number) for number in (0, 1, 2, 3, 6)))
 def test_environments(shell: Shell) -> None:
     shell.block("environments.md", 0)
     shell.block("environments.md", 1, {"for seed in 0 1 2": "for seed in 0"})

@@ -162,7 +162,7 @@ class BatchedGoalMaze:
         self._time += 1
         return Step(
             observations=self._observe(),
-            rewards=reached - self._cost,
+            rewards=reached.astype(np.float64) - self._cost,
             terminated=reached,
             truncated=(self._time >= self.horizon) & ~reached,
             success=reached.copy(),
