@@ -194,17 +194,18 @@ def in_small(data: dict[str, Any], source: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def one_supervisor(folder: Path) -> Iterator[None]:
+def one_supervisor() -> Iterator[None]:
     """All grids are worked through by one process, which is started once, instead of by as many as there are cores.
 
     What it works on, every task says anew. It answers one grid's one place: never with `--max-parallel 2`.
     """
-    supervisor = warm.WarmSupervisor(folder)
+    supervisor = warm.WarmSupervisor()
     release, close = supervisor.release, supervisor.close
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(supervisor, "release", lambda: None)
         patch.setattr(supervisor, "close", lambda _: None)
-        patch.setattr(warm, "WarmSupervisor", lambda _: supervisor)
+        patch.setattr(supervisor, "kill", lambda: None)
+        patch.setattr(warm, "WarmSupervisor", lambda: supervisor)
         patch.setattr("space_dist.api.grids.cores", lambda: 1)
         yield
     release()

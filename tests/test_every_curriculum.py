@@ -44,6 +44,7 @@ KINDS = {
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
     "manual": "{kind: manual, column: effort}",
+    "watched": "{kind: watched, iterations: 4, shares: 2}",
 }
 
 
@@ -117,8 +118,8 @@ def test_a_state_survives_storage_and_the_rows_of_the_file_decide_nothing(kind: 
 
 
 def test_every_kind_of_curriculum_is_covered() -> None:
-    # test_curricula, test_curriculum_variants, test_user_curriculum
-    known = {"space", "random_growth", "cspace", "round_robin", "fixed", "custom"}
+    # test_curricula, test_curriculum_variants, test_user_curriculum, test_causal
+    known = {"space", "random_growth", "cspace", "round_robin", "fixed", "custom", "replay"}
     covered = {configs.load(SPACE, [f"curriculum={text}"]).curriculum.kind for text in KINDS.values()}
     import typing
 

@@ -82,7 +82,7 @@ def place(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     mark, sockets = secrets.token_hex(8), Path(f"/tmp/sd{secrets.token_hex(4)}")  # noqa: S108 - must be short
     folder, served = tmp_path_factory.mktemp("clone"), tmp_path_factory.mktemp("mlflow")
     shutil.copy(empty_store, served / "mlflow.db")
-    with ray_reads_its_environment_anew(), pytest.MonkeyPatch.context() as patch, one_supervisor(folder):
+    with ray_reads_its_environment_anew(), pytest.MonkeyPatch.context() as patch, one_supervisor():
         for name, value in {
             MARK: mark, "HOME": str(folder / "home"), "RAY_TMPDIR": str(sockets), "RAY_AUTH_MODE": "token",
             "PYTHONPATH": str(ROOT), "RAY_USAGE_STATS_ENABLED": "0",

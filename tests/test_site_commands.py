@@ -34,8 +34,8 @@ WITHOUT = 'pip() { echo "not done: pip $*"; }\n'
 
 
 @pytest.fixture(scope="module")
-def _supervised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with one_supervisor(tmp_path_factory.mktemp("supervisor")):
+def _supervised() -> Iterator[None]:
+    with one_supervisor():
         yield
 
 

@@ -342,8 +342,8 @@ def test_a_search_ends_with_the_same_bytes(
 
 
 @pytest.fixture
-def _one_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with one_supervisor(tmp_path_factory.mktemp("supervisor")):
+def _one_process() -> Iterator[None]:
+    with one_supervisor():
         yield
 
 

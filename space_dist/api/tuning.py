@@ -13,6 +13,7 @@ from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.experiment.tuning import find_tune
 from space_dist.grid.conductor import Overview, working_on
+from space_dist.grid.warm import WarmPlaces
 from space_dist.system.extras import needed_from
 from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
@@ -43,9 +44,9 @@ def run_search(
     """
     look_here_too()
     base = workplace() / "runs" if root is None else lasting(Path(root), "root")
-    place = planned(Path(search), base)
     stop = StopRequests()
-    with shown(progress is True) as show:
+    with WarmPlaces(max_parallel) as warm, shown(progress is True) as show:
+        place = planned(Path(search), base)
 
         @contextmanager
         def observing(manifest: Manifest) -> Iterator[Callable[[Overview], None]]:
@@ -57,7 +58,7 @@ def run_search(
             yield observe
 
         with working_on(place, place.manifest(), wait=True, stop_requested=stop.reason, say=show):
-            searched_through(place, observing=observing, stop=stop, max_parallel=max_parallel)
+            searched_through(place, observing=observing, stop=stop, max_parallel=max_parallel, warm=warm)
     return GridRun(place.folder)
 
 
@@ -72,8 +73,8 @@ def planned(path: Path, root: Path) -> Grid:
 
 def searched_through(
     place: Grid, *, observing: Observing, stop: StopRequests, address: str = "local", mode: Mode = "auto",
-    max_parallel: int | None = None, nodes: int = 1, reinstall: Callable[[], None] = lambda: None,
-    say: Callable[[str], None] = lambda line: None,
+    max_parallel: int | None = None, nodes: int = 1, warm: WarmPlaces | None = None,
+    reinstall: Callable[[], None] = lambda: None, say: Callable[[str], None] = lambda line: None,
 ) -> Manifest:  # fmt: skip
     """Work through generation after generation of a planned search; returns its manifest in the end.
 
@@ -91,7 +92,7 @@ def searched_through(
             with observing(manifest) as observe:
                 worked_through(
                     place, manifest, runs, stop=stop, observe=observe, address=address, mode=mode,
-                    max_parallel=max_parallel, nodes=nodes, reinstall=reinstall,
+                    max_parallel=max_parallel, nodes=nodes, warm=warm, reinstall=reinstall,
                 )  # fmt: skip
         after = advance(place, manifest)
         if after is None:  # somebody has let a failed run be tried again meanwhile

@@ -6,7 +6,7 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from space_dist.experiment.manifest import Grid, Manifest, Run
     from space_dist.experiment.status import RunStatus
     from space_dist.grid.jobs import Mode, Remote
+    from space_dist.grid.warm import WarmPlaces
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
 
@@ -124,19 +125,20 @@ def grid_run(
     """Work through a grid: skip what is done, go on with what is not, retry by cause."""
     chosen = mode_of(mode)
     prepare(address)
-    from space_dist.api.grids import frozen
+    with started_ahead(address, chosen, max_parallel) as warm:
+        from space_dist.api.grids import frozen
 
-    place, manifest = frozen(grid, root_of(root), scale)
-    if digest is not None and digest != manifest.runs_digest:
-        raise ConfigError(
-            f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
-            "export the grid again, and submit that"
-        )
-    if stop_file is not None:
-        STOP.watch(stop_file, manifest.resources.grace_seconds)
-    found = run_frozen(
-        place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part
-    )  # fmt: skip
+        place, manifest = frozen(grid, root_of(root), scale)
+        if digest is not None and digest != manifest.runs_digest:
+            raise ConfigError(
+                f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
+                "export the grid again, and submit that"
+            )
+        if stop_file is not None:
+            STOP.watch(stop_file, manifest.resources.grace_seconds)
+        found = run_frozen(
+            place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part, warm=warm
+        )  # fmt: skip
     raise typer.Exit(tell(manifest, place, found))
 
 
@@ -340,11 +342,11 @@ def grid_work(
 
 def run_frozen(
     place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None, *, address: str = "local", mode: Mode = "auto",
-    max_parallel: int | None = None, nodes: int = 1, part: str | None = None,
+    max_parallel: int | None = None, nodes: int = 1, part: str | None = None, warm: WarmPlaces | None = None,
 ) -> list[RunStatus]:  # fmt: skip
     """Work through a frozen grid, or these runs of it, with a display; returns where they stand in the end.
 
-    part: `FIRST-LAST` of them, counted from 0.
+    part: `FIRST-LAST` of them, counted from 0. warm: from `started_ahead`.
     """
     prepare(address)
     from space_dist.api.grids import worked_through
@@ -358,7 +360,7 @@ def run_frozen(
         observe = stack.enter_context(display(manifest, place))
         return worked_through(
             place, manifest, chosen, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
-            stop=STOP, reinstall=STOP.install, observe=observe,
+            warm=warm, stop=STOP, reinstall=STOP.install, observe=observe,
         )  # fmt: skip
 
 
@@ -372,6 +374,18 @@ def prepare(address: str) -> None:
         from space_dist.system.workplace import private_ray
 
         private_ray()
+
+
+@contextlib.contextmanager
+def started_ahead(address: str, mode: Mode, max_parallel: int | None) -> Iterator[WarmPlaces | None]:
+    """Processes that import what runs need while it is planned what they will do, where runs work without Ray."""
+    if address != "local" or mode != "auto":
+        yield None
+        return
+    from space_dist.grid.warm import WarmPlaces
+
+    with WarmPlaces(max_parallel) as warm:
+        yield warm
 
 
 def root_of(root: Path | None) -> Path:

@@ -25,6 +25,7 @@ from space_dist.cli.grids import (
     print_json,
     root_of,
     run_statuses_of,
+    started_ahead,
 )
 from space_dist.cli.overview import display, print_failures, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
@@ -97,16 +98,17 @@ def tune_run(
     """Work through a search, generation by generation: skip what is done, go on with what is not."""
     chosen = mode_of(mode)
     prepare(address)
-    from space_dist.api.tuning import planned, searched_through
-    from space_dist.grid.conductor import working_on
+    with started_ahead(address, chosen, max_parallel) as warm:
+        from space_dist.api.tuning import planned, searched_through
+        from space_dist.grid.conductor import working_on
 
-    place = planned(tune, root_of(root))
-    log_to(place)
-    with working_on(place, place.manifest(), wait=True, stop_requested=STOP.reason, say=warn):
-        manifest = searched_through(
-            place, observing=lambda manifest: display(manifest, place), stop=STOP, address=address, mode=chosen,
-            max_parallel=max_parallel, nodes=nodes, reinstall=STOP.install, say=say,
-        )  # fmt: skip
+        place = planned(tune, root_of(root))
+        log_to(place)
+        with working_on(place, place.manifest(), wait=True, stop_requested=STOP.reason, say=warn):
+            manifest = searched_through(
+                place, observing=lambda manifest: display(manifest, place), stop=STOP, address=address, mode=chosen,
+                max_parallel=max_parallel, nodes=nodes, warm=warm, reinstall=STOP.install, say=say,
+            )  # fmt: skip
     tell_outcome(place, manifest)
     say(f"`space-dist tune confirm {place.folder}` writes the grid that tells what it is worth")
 

@@ -24,11 +24,13 @@ from space_dist.config.curriculum import (
     ManualConfig,
     ProximalConfig,
     RandomGrowthConfig,
+    ReplayConfig,
     RoundRobinConfig,
     SelfPacedConfig,
     SpaceConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.config.explaining import schema
 from space_dist.config.identities import NOT_IDENTITY, changes, differences, flattened, identity
@@ -101,6 +103,7 @@ __all__ = [
     "Patience",
     "ProximalConfig",
     "RandomGrowthConfig",
+    "ReplayConfig",
     "ResourcesConfig",
     "RolloutConfig",
     "RoundRobinConfig",
@@ -114,6 +117,7 @@ __all__ = [
     "TrackingConfig",
     "UniformConfig",
     "ValueDisagreementConfig",
+    "WatchedConfig",
     "about_shipped",
     "apply_override",
     "beside",

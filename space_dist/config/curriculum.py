@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -405,6 +406,29 @@ class ProximalConfig(_Curriculum):
         return True
 
 
+class WatchedConfig(_Curriculum):
+    """Uniform draws that also count what every instance shows over time: what `space-dist headroom` measures with."""
+
+    kind: Literal["watched"]
+    """Which curriculum: uniform draws, watched."""
+    iterations: int = Field(ge=1, le=10_000_000)
+    """Of the whole run."""
+    shares: int = Field(default=10, ge=1, le=1000)
+    """Into which these are cut."""
+    advantages: bool = True
+    """Whether the sizes of advantages are counted, which on-policy learners have."""
+
+
+class ReplayConfig(_Curriculum):
+    """What another run was trained on, iteration after iteration: a *yoked* control, which adapts to nothing."""
+
+    kind: Literal["replay"]
+    """Which curriculum: another run's, replayed."""
+    of: Path = Field(strict=False)
+    """Folder of that run, which must be done, with a budget not smaller than this one's. A relative path is relative to
+    this config file. It counts by its content, of which the run keeps a copy."""
+
+
 class CustomConfig(_Curriculum):
     """A curriculum of your own: any that keeps the protocol (docs/your_curriculum.md)."""
 
@@ -460,6 +484,8 @@ CurriculumConfig = Annotated[
     | LevelReplayConfig
     | LearnabilityConfig
     | ProximalConfig
+    | ReplayConfig
+    | WatchedConfig
     | CustomConfig,
     Field(discriminator="kind"),
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,27 +18,33 @@ from space_dist.config import (
     ManualConfig,
     ProximalConfig,
     RandomGrowthConfig,
+    ReplayConfig,
     RoundRobinConfig,
     SelfPacedConfig,
     SpaceConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.curricula import variants
-from space_dist.curricula.alp_gmm import AlpGmm
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
-from space_dist.curricula.gaussian import Gaussian
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
 from space_dist.curricula.plr import LevelReplay
 from space_dist.curricula.procurl import Proximal
+from space_dist.curricula.replay import Recording, Replay
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
-from space_dist.curricula.spdrl import SelfPaced
 from space_dist.curricula.vds import ValueDisagreement
+from space_dist.curricula.watching import Watched
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
+
+if TYPE_CHECKING:  # SciPy takes half a second to import, and few curricula need it
+    from space_dist.curricula.alp_gmm import AlpGmm
+    from space_dist.curricula.gaussian import Gaussian
+    from space_dist.curricula.spdrl import SelfPaced
 
 
 class Makers:
@@ -47,9 +53,14 @@ class Makers:
     train: the instance set, and `source` the file it came from.
     draws: how many a round can use.
     bounds: of the contexts of the environment.
+    recorded: what another run was trained on, for who follows it.
     """
 
-    def __init__(self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds) -> None:
+    def __init__(
+        self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds,
+        recorded: bytes | None = None,
+    ) -> None:  # fmt: skip
+        self._recorded = recorded
         self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
 
     def make(self, settings: CurriculumConfig) -> Curriculum:
@@ -68,6 +79,8 @@ class Makers:
             LevelReplayConfig: self._level_replay,
             LearnabilityConfig: self._learnability,
             ProximalConfig: self._proximal,
+            ReplayConfig: self._replay,
+            WatchedConfig: self._watched,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -134,6 +147,8 @@ class Makers:
         return ValueDisagreement(self._train, seed=self._seed, draws=self._draws)
 
     def _alp_gmm(self, settings: AlpGmmConfig) -> AlpGmm:
+        from space_dist.curricula.alp_gmm import AlpGmm
+
         return AlpGmm(
             self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, from_set=settings.over == "set",
             random_share=settings.random_share, fit_rate=settings.fit_rate, history=settings.history,
@@ -162,7 +177,32 @@ class Makers:
             scale=settings.scale, largest=settings.largest_return,
         )  # fmt: skip
 
+    def _watched(self, settings: WatchedConfig) -> Watched:
+        return Watched(
+            self._train, seed=self._seed, draws=self._draws, iterations=settings.iterations, shares=settings.shares,
+            advantages=settings.advantages,
+        )  # fmt: skip
+
+    def _replay(self, settings: ReplayConfig) -> Replay:
+        if self._recorded is None:
+            raise ConfigError("curriculum.kind: replay follows the curriculum of a run, which this is none of")
+        try:
+            recording = Recording.decode(self._recorded)
+        except ValueError as error:
+            raise ConfigError(f"curriculum.of: {settings.of} holds no recorded curriculum: {error}") from None
+        strangers = recording.strangers(self._train)
+        if len(strangers):
+            more = f" (and {len(strangers) - 1} more)" if len(strangers) > 1 else ""
+            raise ConfigError(
+                f"curriculum.of: {settings.of} was trained on instance {strangers[0]}{more}, which {self._source} does "
+                "not have, or with another context: who follows a run needs its instances"
+            )
+        return Replay(self._train, recording, draws=self._draws)
+
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
+        from space_dist.curricula.gaussian import Gaussian
+        from space_dist.curricula.spdrl import SelfPaced
+
         bounds = self._bounds
         middle, width = (bounds.low + bounds.high) / 2.0, bounds.high - bounds.low
         initial = Gaussian.of(
@@ -185,6 +225,8 @@ class Makers:
         )  # fmt: skip
 
     def _set_moments(self) -> Gaussian:
+        from space_dist.curricula.gaussian import Gaussian
+
         contexts = self._train.contexts
         # ddof=0: the set is the whole of what is aimed at, and no sample of it.
         covariance = np.atleast_2d(np.cov(contexts, rowvar=False, ddof=0)) if len(contexts) > 1 else None

@@ -1,4 +1,4 @@
-"""Goal maze (Klink et al. 2022): walk round a block to a goal, which most contexts put where nobody can go.
+"""Goal maze (Klink et al. 2022): walk round a block to a goal, if it is where one can come near enough to it.
 
 Facts: docs/environments.md ("Goal maze"); Klink et al., "Curriculum Reinforcement Learning via Constrained Optimal
 Transport", ICML 2022, and its public code, of which there is nothing here.

@@ -46,7 +46,7 @@ class PoolWorker:
 
     def __init__(self, folder: str, nonce: str) -> None:
         refuse_other_folder(Path(folder), nonce)
-        self._supervisor = WarmSupervisor(Path(folder))
+        self._supervisor = WarmSupervisor()
 
     def attempt(self, task: Task) -> list[dict[str, Any]] | None:
         """How the attempts of a task ended; None if the supervisor was lost with them."""

@@ -40,12 +40,13 @@ from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistEr
 from space_dist.experiment.endings import AskedBy, Busy, Ended, Evidence, Said, why_ended
 from space_dist.experiment.manifest import Grid, Manifest, Run, RunResources
 from space_dist.experiment.status import Attempts, is_done, last_lines, slurm_job
-from space_dist.system.files import open_own
+from space_dist.system.files import appending, open_own
 from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.processes import collect_seldom
 
 OUTPUT = "output.txt"
+SAID = "pool.log"  # by supervisors, in a grid's folder
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
 _LOOK_SECONDS = 0.1
 _SIGN_SECONDS = 5.0
@@ -439,6 +440,7 @@ def main() -> None:
     supervisor, manager = Supervisor(), _Manager()
     print(json.dumps({"ready": os.getpid()}), file=results, flush=True)
     for task in manager.tasks():
+        _say_into(Path(task.grid))
         try:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
@@ -449,8 +451,16 @@ def main() -> None:
 
 def preload() -> None:
     """Import what every run needs, so that forks need not. Starts no thread."""
+    import space_dist.curricula.configured
     import space_dist.learner
     import space_dist.run.population  # noqa: F401
+
+
+def _say_into(grid: Path) -> None:
+    """Write what is not an answer into the folder of the grid that is worked on."""
+    with contextlib.suppress(OSError), appending(grid / SAID) as file:  # its attempts tell that nothing can be written
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
 
 
 if __name__ == "__main__":

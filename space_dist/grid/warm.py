@@ -10,7 +10,7 @@ import os
 import select
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -22,8 +22,8 @@ from space_dist.errors import SpaceDistError
 from space_dist.experiment.endings import Cause, Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import settled
-from space_dist.grid.supervisor import KILL_SECONDS, STOPPED_SECONDS, AttemptId, Task
-from space_dist.system.files import in_words
+from space_dist.grid.supervisor import KILL_SECONDS, SAID, STOPPED_SECONDS, AttemptId, Task
+from space_dist.system.files import appending, in_words
 from space_dist.system.importing import PYTHON
 from space_dist.system.workplace import cores
 
@@ -34,6 +34,7 @@ _PAUSE_SECONDS = 0.5  # before another is started where one died
 _SHARE_OF_MEMORY = 0.7  # as Ray takes it: the rest is the system's, and other people's
 _GROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of control groups, in both versions
 _CHUNK = 1 << 16
+_AHEAD = 8  # supervisors that are started before it is known how many are wanted
 
 
 class SupervisorLostError(Exception):
@@ -41,21 +42,24 @@ class SupervisorLostError(Exception):
 
 
 class WarmSupervisor:
-    """`python -m space_dist.grid.supervisor` behind two pipes: started with its first task, and anew when it is lost.
+    """`python -m space_dist.grid.supervisor` behind two pipes: started by its first task, and anew when it is lost."""
 
-    folder: of the grid, where what it says besides goes.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._words = b""
         self._stopped_since: float | None = None
 
+    def start(self, folder: Path | None = None) -> None:
+        """Have it import what runs need, where it does not run already.
+
+        folder: of the grid where what it says goes from the start, and not with its first task only.
+        """
+        if self._process is None or self._process.poll() is not None:
+            self._process, self._words = _started(folder), b""
+
     def begin(self, task: Task) -> None:
         """Hand it attempts to make."""
-        if self._process is None or self._process.poll() is not None:
-            self._process, self._words = self._started(), b""
+        self.start(Path(task.grid))
         self._send(dataclasses.asdict(task))
 
     def ended(self, seconds: float | None = None) -> list[dict[str, Any]] | None:
@@ -103,6 +107,12 @@ class WarmSupervisor:
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
 
+    def kill(self) -> None:
+        """End it at once: it has nothing to do."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
     def close(self, seconds: float) -> None:
         """Release it, and wait for its end; kill it if that takes longer than `seconds`."""
         self.release()
@@ -114,20 +124,52 @@ class WarmSupervisor:
             self._process.kill()
             self._process.wait()
 
-    def _started(self) -> subprocess.Popen[bytes]:
-        command = [*PYTHON, "-m", "space_dist.grid.supervisor"]
-        # Nothing of a Ray actor's own identity: runs that join Ray join it as drivers.
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
-        with (self._folder / "pool.log").open("ab") as errors:
-            return subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
-            )  # fmt: skip
-
     def _send(self, message: dict[str, Any]) -> None:
         if self._process is not None and self._process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.write(json.dumps(message).encode() + b"\n")
                 self._process.stdin.flush()
+
+
+def _started(folder: Path | None) -> subprocess.Popen[bytes]:
+    command = [*PYTHON, "-m", "space_dist.grid.supervisor"]
+    # Nothing of a Ray actor's own identity: runs that join Ray join it as drivers.
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
+    with Path(os.devnull).open("ab") if folder is None else appending(folder / SAID) as errors:
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
+        )  # fmt: skip
+
+
+class WarmPlaces:
+    """Supervisors of this machine that outlive what they are lent for: the next grid, or generation, starts at once.
+
+    As a context: they end with it. limit: how many are wanted at a time at most.
+    """
+
+    def __init__(self, limit: int | None = None) -> None:
+        self._idle = [WarmSupervisor() for _ in range(min(limit or cores(), cores(), _AHEAD))]
+
+    def __enter__(self) -> WarmPlaces:
+        with contextlib.suppress(OSError):  # told by whoever cannot do without
+            for supervisor in self._idle:
+                supervisor.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for supervisor in self._idle:
+            supervisor.kill()
+
+    def lent(self, count: int) -> list[WarmSupervisor]:
+        """As many as that, of which the first are warm."""
+        lent, self._idle = self._idle[:count], self._idle[count:]
+        return lent + [WarmSupervisor() for _ in range(count - len(lent))]
+
+    def take_back(self, supervisors: Iterable[WarmSupervisor]) -> None:
+        """Those that have nothing to do."""
+        self._idle.extend(supervisors)
 
 
 def understood(attempts: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any]]) -> list[tuple[Run, Ended | None]]:
@@ -162,12 +204,19 @@ class _Place:
 
 
 class LocalExecutor:
-    """An `Executor` of `size` places here, for runs without rollout actors: there is nothing for Ray to do."""
+    """An `Executor` of `size` places here, for runs without rollout actors: there is nothing for Ray to do.
 
-    def __init__(self, grid: Grid, manifest: Manifest, size: int, stop_requested: Callable[[], str | None]) -> None:
+    warm: who lends it supervisors, and takes those back that have nothing left to do.
+    """
+
+    def __init__(
+        self, grid: Grid, manifest: Manifest, size: int, stop_requested: Callable[[], str | None],
+        warm: WarmPlaces | None = None,
+    ) -> None:  # fmt: skip
         self.size, self.memory_mb = size, memory_of_a_core() * min(1.0, cores() / size)
-        self._grid, self._stop_requested = grid, stop_requested
-        self._places = [_Place(WarmSupervisor(grid.folder)) for _ in range(size)]
+        self._grid, self._stop_requested, self._warm = grid, stop_requested, warm
+        lent = [WarmSupervisor() for _ in range(size)] if warm is None else warm.lent(size)
+        self._places = [_Place(supervisor) for supervisor in lent]
         self._seconds = manifest.resources.grace_seconds + KILL_SECONDS
 
     def __enter__(self) -> LocalExecutor:
@@ -176,10 +225,13 @@ class LocalExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for place in self._places:
+        busy = [place for place in self._places if place.attempts or self._warm is None]
+        if self._warm is not None:
+            self._warm.take_back(place.supervisor for place in self._places if not place.attempts)
+        for place in busy:
             place.supervisor.release()  # all at once, and then each is waited for
         deadline = time.monotonic() + 2 * self._seconds
-        for place in self._places:
+        for place in busy:
             place.supervisor.close(max(0.0, deadline - time.monotonic()))
 
     def room(self) -> int:

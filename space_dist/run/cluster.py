@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -173,17 +174,20 @@ class CurriculumHost:
 class Central(CurriculumHost):
     """The host of a run's curriculum."""
 
-    def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
+    def __init__(
+        self, config: RunConfig, train: InstanceSet, bounds: ContextBounds,
+        given: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         from space_dist.curricula.making import make_curriculum
 
-        super().__init__(make_curriculum(config, train, bounds), config.curriculum)
+        super().__init__(make_curriculum(config, train, bounds, given), config.curriculum)
 
 
 class InProcess:
     """The cluster's twin without Ray: everything at once, here. Same bits."""
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._setup, self._central = setup, Central(config, setup.train, setup.spec.context_bounds)
+        self._setup, self._central = setup, Central(config, setup.train, setup.spec.context_bounds, setup.given)
         self._worker = Worker(setup)
 
     def put(self, value: object) -> Handle:

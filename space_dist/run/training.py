@@ -132,13 +132,20 @@ class Training:
         status: Status,
         pause_at: int = 0,
         change_at: int = 0,
+        curriculum_number: int = 0,
+        ends_curriculum: bool = False,
         stop_requested: Callable[[], str | None] = lambda: None,
         observe: Callable[[Progress], None] = lambda progress: None,
     ) -> None:
-        """pause_at, change_at: steps at which it ends before its budget does, to be gone on with; 0: nowhere."""
+        """pause_at, change_at: steps at which it ends before its budget does, to be gone on with; 0: nowhere.
+
+        curriculum_number: curricula that were in force before this one, which begins anew in a run that has another.
+        ends_curriculum: whether another one comes into force at `change_at`.
+        """
         self._config, self._setup, self._cluster, self._writer = blueprint.config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
         self._pause_at, self._change_at = pause_at, change_at
+        self._curriculum_number, self._ends_curriculum = curriculum_number, ends_curriculum
         self._horizon = setup.spec.horizon
         self._total_steps = blueprint.total_steps
         self.learner = blueprint.learner()
@@ -208,7 +215,7 @@ class Training:
         cluster = self._cluster
         if self._config.init_from is not None:
             ledger = self._writer.ledger
-            start_from(self.learner, ledger.read(ledger.initial_weights))
+            start_from(self.learner, ledger.read(ledger.given["init_from"]))
         elif self.learner.normalises:
             yield from self._measure_scales()
         policy = cluster.put(self.learner.policy(0))
@@ -430,10 +437,7 @@ class Training:
 
     def _finish(self) -> Work[None]:
         run = self._run
-        if run.rollouts:  # the budget ended inside an iteration: its steps are logged, its decision is never made
-            yield from self._settle()
-            self._append({**self._iteration_row(complete=False), "curriculum": {}})
-            run.rollouts, run.updates, run.seen = [], [], []
+        yield from self._end_iteration()
         yield from self._commit("done")
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
@@ -445,6 +449,16 @@ class Training:
         }  # fmt: skip
         self._writer.write_model(arrays, description)
         self._writer.set_status(self._new_status("done"))
+
+    def _end_iteration(self) -> Work[bool]:
+        """Log the steps of an iteration that is not complete, whose decision is never made. Returns whether one was."""
+        run = self._run
+        if not run.rollouts:
+            return False
+        yield from self._settle()
+        self._append({**self._iteration_row(complete=False), "curriculum": {}})
+        run.rollouts, run.updates, run.seen = [], [], []
+        return True
 
     # ---- waiting, and the ledger ----
 
@@ -484,6 +498,9 @@ class Training:
         """Commit where this part of the run ends, if it does: the next part goes on from there, as if resumed."""
         if self._is_over():
             return False
+        if self._ends_curriculum and 0 < self._change_at <= self._run.steps and (yield from self._end_iteration()):
+            self._run.iteration += 1
+            self._run.gradient_steps = 0
         for place, state in ((self._pause_at, "paused"), (self._change_at, "running")):
             if 0 < place <= self._run.steps:
                 yield from self._commit(state)
@@ -552,6 +569,11 @@ class Training:
         self._segments = list(checkpoint.segments)
         for segment in self._segments:
             self.learner.remember(self._writer.read_segment(segment), segment.first)
+        self._last_commit_round, self._last_row_steps = run.round, run.steps
+        policy = cluster.put(self.learner.policy(run.round))
+        if run.curriculum_number != self._curriculum_number:
+            self._begin_curriculum(policy)
+            return policy
         state = decode_state(
             self._curriculum.state_type, checkpoint.under("curriculum/"), checkpoint.data["curriculum"]
         )  # fmt: skip
@@ -561,11 +583,20 @@ class Training:
         asked.values = cluster.put(checkpoint.arrays["values"])
         if self.ensemble is not None:
             self.ensemble.load(checkpoint.under("ensemble/"))
-        self._last_commit_round, self._last_row_steps = run.round, run.steps
         if run.acted:
             # It was in flight when the checkpoint was made: asked again with the weights that acted then.
             asked.ahead = self._collect(cluster.put(self.learner.policy_of(run.acted, run.round - 1)), lag=1)
-        return cluster.put(self.learner.policy(run.round))
+        return policy
+
+    def _begin_curriculum(self, policy: Handle) -> None:
+        """Have this curriculum choose from here on, as if it were at its start: it replaces the one before it.
+
+        The episodes that run go on. Of their advantages only those of the steps from here on are known.
+        """
+        run, cluster = self._run, self._cluster
+        run.version, run.walk = 0, dataclasses.replace(run.walk, order_version=-1)
+        run.acted, run.sizes, run.curriculum_number = {}, None, self._curriculum_number
+        self._adopt(cluster.begin(cluster.start_values(policy)))
 
     def _show(self) -> None:
         self.progress.steps = self._run.steps

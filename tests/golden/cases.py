@@ -99,6 +99,11 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ]),
     "plr": ("curricula/pointmass_plr", _LEAN),
     "procurl": ("sparse_pointmass_procurl", _LEAN),
+    "replayed draws": ("curricula/pointmass_plr", _LEAN),
+    "forked": ("pointmass_space", [
+        *_LEAN, "fork={seed: 3, steps: 100}",
+        "schedule=[{steps: 200, set: {curriculum: {kind: uniform}, learner.learning_rate: 0.001}}]",
+    ]),
     "learnability": ("cartpole_dqn_space", [
         *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
         "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024",
@@ -107,6 +112,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ]),
 }  # fmt: skip
 """Name -> (shipped config, settings)."""
+_FOLLOWED = {"replayed draws": "plr"}  # the case whose curriculum another one's runs follow
 
 
 @functools.cache
@@ -145,5 +151,9 @@ def digests_of(folder: Path) -> dict[str, str]:
 def run(name: str, folder: Path) -> dict[str, str]:
     """Run a case in `folder`, in this process; the digests of what it wrote."""
     folder.mkdir(parents=True)
-    launch(config_of(name, folder), folder / "run", resume=False, stop=StopRequests())
+    also: tuple[str, ...] = ()
+    if name in _FOLLOWED:
+        launch(config_of(_FOLLOWED[name], folder), folder / "followed", resume=False, stop=StopRequests())
+        also = (_curriculum(f"kind: replay, of: {folder / 'followed'}"), "seed=1")
+    launch(config_of(name, folder, also), folder / "run", resume=False, stop=StopRequests())
     return digests_of(folder / "run")
