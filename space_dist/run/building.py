@@ -18,7 +18,7 @@ from space_dist.curricula.making import make_curriculum
 from space_dist.curricula.replay import Replay
 from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError, about, nearest
-from space_dist.instances import InstanceSet, read_csv, refuse_overlap
+from space_dist.instances import InstanceSet, read_csv, refuse_overlap, refuse_padding
 from space_dist.learner import (
     CoupledLearner,
     Ensemble,
@@ -85,7 +85,8 @@ class Blueprint:
     def instances(self) -> tuple[InstanceSet, InstanceSet]:
         """The training and test instances, from their files.
 
-        Raises ConfigError for a bad file, a context outside the environment's bounds, or one that both share.
+        Raises ConfigError for a bad file, a context outside the environment's bounds, or one that both share; and for
+        a test set with padding, in which no policy would succeed.
         """
         files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.columns_read
         with about("instances.train"):
@@ -93,6 +94,7 @@ class Blueprint:
         with about("instances.test"):
             test = read_csv(files.test, bounds, columns, if_there=True)
         refuse_overlap(train, test, str(files.train), str(files.test))
+        refuse_padding(test, f"instances.test: {files.test}")
         return train, test
 
     def setup(self, train: InstanceSet, test: InstanceSet) -> Setup:

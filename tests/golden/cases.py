@@ -32,7 +32,7 @@ _CONTINUOUS = "net_arch: [32, 32], batch_size: 32, learning_starts: 128, gradien
 
 # Of twelve instances none would be left out where the set grows as in the shipped configs.
 _GROWTH = ["curriculum.eta=0.1", "curriculum.kappa=1"]
-_GROWING = {"pointmass_space", "antgoal_space", "ballcatching_space"}
+_GROWING = {"pointmass_space", "antgoal_space", "ballcatching_space", "goalmaze_space", "mixed_maze_space"}
 
 _COLUMN = "difficulty"  # what `manual` goes by; in the training instances of its case alone
 
@@ -81,6 +81,8 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_PPO, "env.kwargs.horizon=24", "learner.batch_size=64", "learner.net_arch=[32, 32]",
         "learner.update=stock",
     ]),
+    "goalmaze": ("goalmaze_space", _LEAN),
+    "mixed maze": ("mixed_maze_space", [*_PPO, "env.kwargs.horizon=24", "learner.batch_size=64"]),
     # curricula
     "cspace": ("pointmass_space", [*_LEAN, _curriculum("kind: cspace, kappa: 2, eta: 4")]),
     "round robin": ("pointmass_round_robin", _LEAN),
