@@ -25,16 +25,16 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
 from space_dist.errors import Interrupted
-from space_dist.learner import Arrays, Learner, Update
+from space_dist.learner import Arrays, Update
 from space_dist.ledger import (
     CURRICULUM,
     METRICS,
@@ -54,6 +54,7 @@ from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
+from space_dist.run.requests import Learn, Wait, Work
 from space_dist.run.rows import iteration_row, position, summary, trained_row
 from space_dist.run.starting import start_from
 from space_dist.run.state import RunState
@@ -95,28 +96,6 @@ class _Pending:
 
     handles: list[Handle]
     settle: Callable[[list[Any]], None]
-
-
-@dataclass(frozen=True)
-class Wait:
-    """A run needs the values of `handles`, as a list, to go on."""
-
-    handles: list[Handle]
-
-
-@dataclass(frozen=True)
-class Learn:
-    """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
-
-    learner: Learner
-    shards: list[Shard]
-    round: int
-    steps: int
-    acted: Arrays | None = None
-
-
-T = TypeVar("T")
-Work = Generator[Wait | Learn, Any, T]
 
 
 class Training:
