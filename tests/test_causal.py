@@ -19,9 +19,11 @@ from space_dist.envs.distributions import sample
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.run import given
 from space_dist.run.launch import Outcome, launch
 from space_dist.run.population import advance, member
 from space_dist.run.recording import recording_in
+from space_dist.run.starting import weights_in
 from space_dist.system.interrupts import StopRequests
 from tests.test_learners import crashed, interrupted, with_checkpoints
 
@@ -177,6 +179,24 @@ def test_a_run_keeps_what_it_follows(sets: Path, of: Any, tmp_path: Path) -> Non
     other = configured(sets, following(of("round_robin")), seed=1)
     with pytest.raises(ConfigError, match=r"another configuration \(curriculum.of: another recorded curriculum\)"):
         launch(other, folder, resume=True, stop=StopRequests())
+
+
+def test_what_is_given_is_read_once_however_often_settings_change(
+    sets: Path, of: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Path] = []
+
+    def counted(path: Path) -> bytes:
+        read.append(path)
+        return weights_in(path)
+
+    monkeypatch.setattr(given, "_READ", {"init_from": counted})
+    changes = [{"steps": steps, "set": {"learner.learning_rate": 0.01}} for steps in (200, 400)]
+    run(
+        configured(sets, KINDS["space"], f"init_from={of('space')}", f"schedule={json.dumps(changes)}"),
+        tmp_path / "run",
+    )
+    assert read == [of("space")]
 
 
 def yaml_of(folder: Path) -> dict[str, Any]:

@@ -82,6 +82,12 @@ class Blueprint:
         """What other runs give it, by the key that names it: read once. Raises ConfigError where it cannot be used."""
         return given_to(self.config)
 
+    def under(self, config: RunConfig) -> Blueprint:
+        """The same run under settings that are in force for a while: what other runs gave it is not read again."""
+        found = dataclasses.replace(self, config=config)
+        vars(found)["given"] = self.given
+        return found
+
     def instances(self) -> tuple[InstanceSet, InstanceSet]:
         """The training and test instances, from their files.
 

@@ -129,7 +129,7 @@ class ActiveRun:
                 return
             checkpoint = writer.restore()
             steps = 0 if checkpoint is None else int(checkpoint.data["run"]["steps"])
-            blueprint = replace(self.blueprint, config=config.at(steps))
+            blueprint = self.blueprint.under(config.at(steps))
             setup = blueprint.setup(self.setup.train, self.setup.test)
             number, change_at = config.curriculum_number(steps), config.change_after(steps)
             yield replace(
