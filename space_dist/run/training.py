@@ -189,7 +189,8 @@ class Training:
             # By steps, not by passes as the paper's: those are of another length for each curriculum (decision 14).
             if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
                 self._evaluate(policy)
-            self._show()
+            if not self._is_over():
+                self._show()
             if (yield from self._has_paused()):
                 return
             yield from self._commit_if_due()
@@ -335,6 +336,12 @@ class Training:
         if not selection.drawn:
             self.progress.set_size = len(selection.ids)
 
+    def _know_returns(self, rows: Sequence[Row]) -> None:
+        """Show the returns of the last evaluation among these rows, if there is one."""
+        for row in rows:
+            if row["kind"] == "evaluation":
+                self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
+
     def _rounds_on(self, selection: Selection) -> int:
         """Rounds of an iteration: as many as pass over the selection at full horizon, and one of what is drawn."""
         config = self._config
@@ -365,7 +372,7 @@ class Training:
                 returns = checked(outcomes.backward_discounted_returns, "returns")
                 row[split]["legacy_return"] = float(returns.mean())
             self._append(row)
-            self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
+            self._know_returns([row])
             log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
 
         self._asked.pending.append(_Pending(handles, settle))
@@ -435,6 +442,7 @@ class Training:
             self._append({**self._iteration_row(complete=False), "curriculum": {}})
             run.rollouts, run.updates, run.seen = [], [], []
         yield from self._commit("done")
+        self._show()  # only now, for the last returns are known since the commit
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
         bounds = self._setup.spec.context_bounds
@@ -561,6 +569,7 @@ class Training:
         asked.values = cluster.put(checkpoint.arrays["values"])
         if self.ensemble is not None:
             self.ensemble.load(checkpoint.under("ensemble/"))
+        self._know_returns(self._writer.ledger.rows(METRICS))
         self._last_commit_round, self._last_row_steps = run.round, run.steps
         if run.acted:
             # It was in flight when the checkpoint was made: asked again with the weights that acted then.
