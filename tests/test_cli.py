@@ -421,6 +421,22 @@ def test_the_schema_can_be_asked_for_a_part(capsys: pytest.CaptureFixture[str]) 
     assert (code, said) == (2, "space-dist: config schema: no key has 'gamm_' in it; did you mean 'gamma'?\n")
 
 
+def test_the_keys_of_grids_and_searches_are_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    _, grid, _ = run(capsys, "config", "schema", "--of", "grid")
+    assert {f"  {key}:" in grid for key in ("name", "zip", "exclude", "retry.killed", "baseline")} == {True}
+    _, search, _ = run(capsys, "config", "schema", "when", "--of", "search")
+    keys = {line.split(":")[0].strip() for line in search.splitlines() if "dict" in line}
+    assert keys == {"search.NAME.when", "arms.NAME.search.NAME.when"}
+    code, _, said = run(capsys, "config", "schema", "retry")
+    assert code == 2
+    assert said.endswith("no key of a run has 'retry' in it; --of grid or --of search shows one that has\n")
+    code, _, said = run(capsys, "config", "schema", "--of", "gird")
+    assert (code, said) == (
+        2,
+        "space-dist: --of 'gird' is not known; did you mean 'grid'? Allowed: run, grid, search\n",
+    )
+
+
 def test_a_pipe_is_told_what_a_run_does(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     settings = [part for setting in SMALL for part in ("--set", setting)]
     code, said, _ = run(capsys, "train", CONFIG, *settings, "--out", tmp_path / "run")
@@ -430,6 +446,24 @@ def test_a_pipe_is_told_what_a_run_does(capsys: pytest.CaptureFixture[str], tmp_
     assert lines[1].startswith("pointmass_space s0: 256/4,096 steps")
     assert lines[-2].startswith("pointmass_space s0: 4,096/4,096 steps")
     assert lines[-1].startswith("pointmass_space, seed 0: done, 4,096 environment steps.")
+
+
+def test_progress_shows_the_last_evaluation_at_the_end_and_after_resuming(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def returns(evaluation: int) -> str:
+        row = [row for row in Ledger(tmp_path / "run").rows() if row["kind"] == "evaluation"][evaluation]
+        return f"return train {row['train']['return']:.2f} test {row['test']['return']:.2f}"
+
+    settings = [part for setting in SMALL for part in ("--set", setting)]
+    command = ["train", CONFIG, *settings, "--set", "evaluation.every_steps=4096", "--out", tmp_path / "run"]
+    _, said, _ = run(capsys, *command)
+    assert said.splitlines()[-2].endswith(returns(-1))
+    _, said, _ = run(capsys, *command, "--set", "budget.steps=8192", "--resume")
+    first, *_, last, _ = [line for line in said.splitlines() if " steps" in line]
+    assert returns(0) in first  # a larger budget goes on from the round before the last, and the last evaluation
+    assert last.endswith(returns(-1))
+    assert len({returns(0), returns(1), returns(2)}) == 3
 
 
 def test_cells_never_look_alike_however_narrow_the_terminal(

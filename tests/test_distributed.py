@@ -55,6 +55,21 @@ def test_an_actor_that_cannot_be_placed_is_an_error(cluster_class: Any, monkeypa
     assert not ray.is_initialized()
 
 
+def test_workers_that_nobody_asked_for_are_no_more_than_there_are_cpus(
+    cluster_class: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import ray
+
+    run = configs.load(ROOT / "configs/pointmass_space.yaml", [*SMALL, "resources.room_seconds=30"])
+    started = ray.init
+    monkeypatch.setattr(ray, "init", lambda **options: started(**{**options, "num_cpus": 1}))
+    monkeypatch.setattr("space_dist.run.ray_cluster.n_workers", lambda config, spec: config.rollout.shards)
+    assert run.rollout.shards == 4
+    with cluster_class(run, _setup(run)):
+        (room,) = ray.util.placement_group_table().values()
+        assert len(room["bundles"]) == 1
+
+
 @pytest.mark.usefixtures("cluster_class")
 def test_a_ray_that_does_not_start_in_time_is_started_again(
     reference: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

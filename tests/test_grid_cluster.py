@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from space_dist.api.tuning import run_search
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.experiment.manifest import Grid, Run
 from space_dist.experiment.status import Attempts
 from space_dist.grid.planning import plan
@@ -174,6 +174,22 @@ def test_a_dead_job_server_is_one_clear_sentence(cluster: RayHead, tmp_path: Pat
     assert submit.returncode == 1
     assert "does not answer" in said
     assert "Traceback" not in said
+
+
+def test_a_job_server_that_wants_another_token_is_one_clear_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ray.exceptions import AuthenticationError
+
+    from space_dist.grid import jobs
+
+    def refuse(_: str) -> None:
+        raise AuthenticationError("Invalid authentication token")
+
+    monkeypatch.setattr(jobs, "JobSubmissionClient", refuse)
+    manifest = plan(write_grid(tmp_path), tmp_path / "runs").manifest
+    with pytest.raises(SpaceDistError, match=r"lets nobody in .*RAY_AUTH_MODE=token.*\(Invalid authentication token"):
+        jobs.Remote("http://127.0.0.1:9", manifest, tmp_path / "runs")
 
 
 def test_an_address_that_is_no_urls_is_refused_at_once(tmp_path: Path) -> None:

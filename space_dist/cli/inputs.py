@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -15,6 +16,8 @@ from space_dist.errors import ConfigError, about, nearest
 
 if TYPE_CHECKING:
     from space_dist.instances import InstanceSet
+
+SchemaRow = tuple[str, str, str, str]  # key, type, default, explanation
 
 instances_app = typer.Typer(no_args_is_help=True, help="Make and check instance sets.")
 config_app = typer.Typer(no_args_is_help=True, help="Explain and check configs.")
@@ -128,11 +131,13 @@ def config_schema(
             help="Only keys with these letters (gamma, learner.), or of a section of this kind (space, ppo).",
         ),
     ] = None,
+    of: Annotated[str, typer.Option(help="Whose keys: of a run, a grid, or a search.")] = "run",
 ) -> None:
     """Explain every key: type, default, meaning, unit and source."""
-    from space_dist.config import schema
-
-    for key, kind, default, text in schema() if only is None else _about(only):
+    schemas = _schemas()
+    if of not in schemas:
+        raise ConfigError(f"--of {of!r} is not known{nearest(of, schemas)} Allowed: {', '.join(schemas)}")
+    for key, kind, default, text in schemas[of] if only is None else _about(only, of, schemas):
         if kind == "section":
             console.print(f"\n[bold]{key}[/bold]  {text}", highlight=False)
         else:
@@ -143,13 +148,29 @@ def config_schema(
     delivered()
 
 
-def _about(asked: str) -> list[tuple[str, str, str, str]]:
-    """Rows of the schema: of keys with these letters, and of sections of this kind. Raises ConfigError for none."""
-    from space_dist.config import schema
+def _schemas() -> dict[str, list[SchemaRow]]:
+    """The keys of each kind of file that a user writes."""
+    from space_dist.config import RunConfig, schema
+    from space_dist.experiment.manifest import GridConfig
+    from space_dist.experiment.tuning import TuneConfig
 
-    rows = list(schema())
-    found: list[tuple[str, str, str, str]] = []
-    header: tuple[str, str, str, str] | None = None
+    return {name: list(schema(of)) for name, of in (("run", RunConfig), ("grid", GridConfig), ("search", TuneConfig))}
+
+
+def _about(asked: str, of: str, schemas: Mapping[str, list[SchemaRow]]) -> list[SchemaRow]:
+    """Rows of a schema: of keys with these letters, and of sections of this kind. Raises ConfigError for none."""
+    if found := _rows_about(asked, schemas[of]):
+        return found
+    if others := [other for other, rows in schemas.items() if other != of and _rows_about(asked, rows)]:
+        ways = " or ".join(f"--of {other}" for other in others)
+        raise ConfigError(f"config schema: no key of a {of} has {asked!r} in it; {ways} shows one that has")
+    keys = {row[0].rpartition(".")[2] for row in schemas[of]}
+    raise ConfigError(f"config schema: no key has {asked!r} in it{nearest(asked, keys)}")
+
+
+def _rows_about(asked: str, rows: Iterable[SchemaRow]) -> list[SchemaRow]:
+    found: list[SchemaRow] = []
+    header: SchemaRow | None = None
     whole = False
     for row in rows:
         if row[1] == "section":
@@ -159,9 +180,6 @@ def _about(asked: str) -> list[tuple[str, str, str, str]]:
         if asked in row[0] or (inside and whole):
             found += [header] if inside and header is not None and header not in found else []
             found.append(row)
-    if not found:
-        keys = {row[0].rpartition(".")[2] for row in rows}
-        raise ConfigError(f"config schema: no key has {asked!r} in it{nearest(asked, keys)}")
     return found
 
 

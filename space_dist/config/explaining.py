@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 import types
 from collections.abc import Iterator, Mapping
-from typing import Any, Union, get_args, get_origin
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -37,33 +36,49 @@ _SB3_NAMES = {
 }
 
 
-def schema() -> Iterator[tuple[str, str, str, str]]:
-    """(key, type, default, explanation) of every field, in order."""
-    yield from _describe(RunConfig, "")
+def schema(of: type[BaseModel] = RunConfig) -> Iterator[tuple[str, str, str, str]]:
+    """(key, type, default, explanation) of every field of a file, in order; NAME in a key is of the user's choosing."""
+    yield from _describe(of, "")
 
 
 def _describe(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str, str, str]]:
     for name, field in model.model_fields.items():
         key, inner = f"{prefix}{_key(name, field)}", _models(field) or _items(field)
+        if (named := _by_name(field)) is not None:
+            key, inner = f"{key}.NAME", [named]
         if not inner:
             default = "required" if field.is_required() else json.dumps(field.get_default(), default=str)
             yield key, _type_name(field), default, " ".join((field.description or "").split())
         for section in inner:
             tag = f" ({section.model_fields['kind'].annotation.__args__[0]})" if len(inner) > 1 else ""  # type: ignore[union-attr]
-            yield f"{key}{tag}", "section", "", " ".join((section.__doc__ or "").split())
+            about = (None if tag else field.description) or section.__doc__ or ""
+            yield f"{key}{tag}", "section", "", " ".join(about.split())
             yield from _describe(section, f"{key}.")
 
 
 def _type_name(field: Any) -> str:
-    annotation = field.annotation
-    name = str(annotation) if get_origin(annotation) else annotation.__name__
-    name = name.replace("typing.", "").replace("NoneType", "null").replace("None", "null")
+    name = _in_words(field.annotation)
     limits = [f"{symbol} {getattr(item, attribute)}" for item in field.metadata
               for attribute, symbol in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
               if hasattr(item, attribute)]  # fmt: skip
-    if name.startswith("tuple"):
-        name = f"list of {re.findall(r'int|float|str|Literal[^]]*]', name)[0]}"
     return " ".join([name, *limits])
+
+
+def _in_words(annotation: Any) -> str:
+    """A type as the schema names it: `int | null`, `list of float`, `dict[str, list of any]`."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _in_words(inner[0])
+    if origin in (Union, types.UnionType):
+        return " | ".join(map(_in_words, inner))
+    if origin in (tuple, list):
+        count = f"{len(inner)} " if origin is tuple and Ellipsis not in inner else ""
+        return f"list of {count}{_in_words(inner[0])}"
+    if origin is dict:
+        return f"dict[{', '.join(map(_in_words, inner))}]"
+    if origin is not None:
+        return str(annotation).replace("typing.", "")
+    return {types.NoneType: "null", Any: "any"}.get(annotation) or str(annotation.__name__)
 
 
 def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str, str]) -> str:

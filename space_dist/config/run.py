@@ -98,7 +98,7 @@ class RunConfig(Section):
     rollout: RolloutConfig = Field(default=RolloutConfig(), validate_default=True)  # behind learner, which it must fit
     budget: BudgetConfig
     schedule: tuple[Change, ...] = Field(default=(), max_length=1000, strict=False)
-    """Settings that change on the way."""
+    """Settings that change on the way: a list, by steps, ascending; such as population-based training finds."""
     fork: Fork | None = None
     """How far the run is the same as one of another seed. null: it has its own from its start."""
     evaluation: EvaluationConfig = EvaluationConfig()

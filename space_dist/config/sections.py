@@ -210,7 +210,8 @@ class ResourcesConfig(Patience):
     workers: int | Literal["auto"] = Field(default="auto")
     """Ray rollout actors; 0: everything in this process, without Ray. auto: of a Ray of its own, one for
     each CPU and shard at most, where slots are stepped one by one (single environments, PyBullet) and the budget is
-    100,000 steps or more; else 0, as actors would gain nothing. In a cluster: one for each shard."""
+    100,000 steps or more; else 0, as actors would gain nothing. In a cluster: one for each of its CPUs and shard at
+    most."""
     address: str = Field(default="local", min_length=1, max_length=300)
     """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)

@@ -26,6 +26,7 @@ os.environ.update(RAY_DEFAULTS | dict(os.environ))  # before Ray reads it
 
 import ray
 import requests
+from ray.exceptions import AuthenticationError
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
@@ -404,6 +405,11 @@ def _client(address: str) -> JobSubmissionClient:
         raise ConfigError(f"--address {address!r} is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
     try:
         return JobSubmissionClient(address)
+    except AuthenticationError as error:
+        raise SpaceDistError(
+            f"Ray's job server at {address} lets nobody in without its cluster's token: set RAY_AUTH_MODE=token, and "
+            f"have that token in ~/.ray/auth_token ({_first(error)})"
+        ) from error
     except (ConnectionError, RuntimeError, ValueError, requests.RequestException) as error:
         raise SpaceDistError(f"Ray's job server at {address} does not answer: {_first(error)}") from error
 

@@ -40,7 +40,7 @@ from space_dist.grid.planning import InstanceFiles, frozen_cell, resolved_cell
 from space_dist.grid.trials import asked, with_settings
 from space_dist.instances import InstanceSet, refuse_overlap, repeats
 from space_dist.run.building import Blueprint
-from space_dist.run.training import next_evaluation
+from space_dist.run.rows import next_evaluation
 from space_dist.system.files import atomic_write, in_words
 from space_dist.system.provenance import code_digest, git_state
 from space_dist.tracking.settling import settled

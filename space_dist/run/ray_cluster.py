@@ -129,6 +129,8 @@ class RayCluster:
         self._watch.enter_context(attended(found, resources.address, gone=True, leave=shut_down, note=self._note))
         try:
             self._remote_setup = self.put(self._setup)
+            if resources.workers == "auto":
+                self._workers = max(1, min(self._workers, int(cpus()[0])))
             if not self._take_room(self._workers, resources.room_seconds):
                 raise self._no_room(self._workers)
             self._start((*range(self._workers), CENTRAL))

@@ -27,7 +27,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
 from space_dist.run.requests import Learn, Wait, Work
-from space_dist.run.rows import iteration_row, position, summary, trained_row
+from space_dist.run.rows import iteration_row, next_evaluation, position, summary, trained_row
 from space_dist.run.starting import start_from
 from space_dist.run.state import RunState
 
@@ -178,7 +178,8 @@ class Training:
             # By steps, not by passes as the paper's: those are of another length for each curriculum (decision 14).
             if self._is_over() or run.steps >= next_evaluation(config.evaluation.every_steps, run.evaluated_at):
                 self._evaluate(policy)
-            self._show()
+            if not self._is_over():
+                self._show()
             if (yield from self._has_paused()):
                 return
             yield from self._commit_if_due()
@@ -324,6 +325,12 @@ class Training:
         if not selection.drawn:
             self.progress.set_size = len(selection.ids)
 
+    def _know_returns(self, rows: Sequence[Row]) -> None:
+        """Show the returns of the last evaluation among these rows, if there is one."""
+        for row in rows:
+            if row["kind"] == "evaluation":
+                self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
+
     def _rounds_on(self, selection: Selection) -> int:
         """Rounds of an iteration: as many as pass over the selection at full horizon, and one of what is drawn."""
         config = self._config
@@ -354,7 +361,7 @@ class Training:
                 returns = checked(outcomes.backward_discounted_returns, "returns")
                 row[split]["legacy_return"] = float(returns.mean())
             self._append(row)
-            self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
+            self._know_returns([row])
             log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
 
         self._asked.pending.append(_Pending(handles, settle))
@@ -421,6 +428,7 @@ class Training:
         run = self._run
         yield from self._end_iteration()
         yield from self._commit("done")
+        self._show()  # only now, for the last returns are known since the commit
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
         bounds = self._setup.spec.context_bounds
@@ -552,6 +560,7 @@ class Training:
         for segment in self._segments:
             self.learner.remember(self._writer.read_segment(segment), segment.first)
         self._last_commit_round, self._last_row_steps = run.round, run.steps
+        self._know_returns(self._writer.ledger.rows(METRICS))
         policy = cluster.put(self.learner.policy(run.round))
         if run.curriculum_number != self._curriculum_number:
             self._begin_curriculum(policy)
@@ -583,11 +592,3 @@ class Training:
     def _show(self) -> None:
         self.progress.steps = self._run.steps
         self._observe(self.progress)
-
-
-def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int:
-    """Steps at which the next evaluation falls due; it is made after the first update at or behind them."""
-    if every_steps == "log":
-        marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
-        return next(mark for mark in marks if mark > evaluated_at)
-    return (evaluated_at // every_steps + 1) * every_steps
