@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import space_dist.cli  # noqa: F401  # isort: skip - one thread for all arithmetic, before NumPy is imported
 
+import signal
+from types import FrameType
+
 import typer
 from benchmarks import (
     arithmetic,
@@ -50,7 +53,13 @@ def _benchmarks() -> None:
     """Speed lives here, not in tests."""
 
 
+def _end(number: int, _: FrameType | None) -> None:
+    """End as on Ctrl-C: whoever has started processes ends them on the way out."""
+    raise SystemExit(128 + number)
+
+
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, _end)
     try:
         app()
     except SpaceDistError as error:

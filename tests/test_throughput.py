@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +20,7 @@ from space_dist.envs.pointmass import BOUNDS as POINTMASS_BOUNDS
 from space_dist.envs.pointmass import START, BatchedPointMass
 from space_dist.errors import SpaceDistError
 from tests.grids import ROOT
+from tests.patience import PATIENCE
 
 sys.path.append(str(ROOT / "jobs"))
 
@@ -164,3 +170,37 @@ def test_jaxs_point_masses_go_where_ours_do() -> None:
         going &= ~(step.terminated | step.truncated)
     assert crashed
     assert truncated
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_ended_benchmark_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
+    name, value = "SPACE_DIST_TEST", str(tmp_path)
+
+    def marked() -> set[int]:
+        found = set()
+        for folder in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if f"{name}={value}".encode() in (folder / "environ").read_bytes():
+                    found.add(int(folder.name))
+        return found
+
+    code = (
+        "import runpy, sys; import benchmarks.throughput as t; t._missing = lambda: ['rllib', 'jax', 'sbx'];"
+        "sys.argv = ['benchmark.py', 'throughput', '--only', 'pointmass', '--seconds', '600'];"
+        f"runpy.run_path({str(ROOT / 'jobs/benchmark.py')!r}, run_name='__main__')"
+    )
+    environment = {**os.environ, name: value, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'jobs'}"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while len(marked()) < 2 and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 128 + number, said
+        assert marked() == set()
+    finally:
+        for pid in marked():
+            os.kill(pid, signal.SIGKILL)

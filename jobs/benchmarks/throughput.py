@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import json
@@ -12,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -121,7 +122,10 @@ def throughput(
     out: Annotated[Optional[Path], typer.Option(help="Folder for the table and the figure.")] = None,  # noqa: UP045
     json_file: JsonFile = None,
 ) -> None:
-    """Environment steps per second of PPO: ours (stock, lean, population) beside JAX, SBX, SB3 and RLlib."""
+    """Environment steps per second of PPO: ours (stock, lean, population) beside JAX, SBX, SB3 and RLlib.
+
+    First it searches for the fastest setting of each, which takes longer than the rounds do; --settings keeps them.
+    """
     unknown = sorted({*(only or ())} - {*PARTS})
     if unknown:
         raise typer.BadParameter(f"{unknown[0]} is no part; allowed: {', '.join(PARTS)}", param_hint="--only")
@@ -364,24 +368,33 @@ def _jax_seconds(contender: Contender, member_steps: int) -> float:
 
 def _together(wanted: Sequence[tuple[str, Contender]], patience: float | None = None) -> list[dict[str, float]]:
     """What so many processes at once have found; nothing if they take longer than `patience` seconds."""
-    running = [_start(asked, contender.first, contender.checkout) for asked, contender in wanted]
-    try:
-        return [_finish(process, one, patience) for process, (one, _) in zip(running, wanted, strict=True)]
-    except subprocess.TimeoutExpired:
-        return []
-    finally:
-        for process in running:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+    with contextlib.ExitStack() as running:
+        processes = [running.enter_context(_started(asked, one.first, one.checkout)) for asked, one in wanted]
+        try:
+            return [_finish(process, one, patience) for process, (one, _) in zip(processes, wanted, strict=True)]
+        except subprocess.TimeoutExpired:
+            return []
 
 
 def process(wanted: str, first: str, checkout: str = "") -> dict[str, float]:
     """What one process of `contenders` finds, which does something else `first`; of another version, if wanted."""
-    return _finish(_start(wanted, first, checkout), wanted)
+    with _started(wanted, first, checkout) as running:
+        return _finish(running, wanted)
 
 
-def _start(wanted: str, first: str, checkout: str = "") -> subprocess.Popen[str]:
+@contextlib.contextmanager
+def _started(wanted: str, first: str, checkout: str) -> Iterator[subprocess.Popen[str]]:
+    """A process, which ends with this block at the latest, and with it whatever it has started."""
+    running = _start(wanted, first, checkout)
+    try:
+        yield running
+    finally:
+        if running.poll() is None:
+            os.killpg(running.pid, signal.SIGKILL)
+            running.wait()
+
+
+def _start(wanted: str, first: str, checkout: str) -> subprocess.Popen[str]:
     # OpenMP's threads are what torch's contenders set themselves; everything else keeps to one.
     environment = environment_of(checkout)
     environment |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")

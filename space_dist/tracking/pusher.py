@@ -40,8 +40,10 @@ class Pusher:
         """None once it has ended well; after `seconds` it is ended, and this says what the mirror may lack."""
         if ended_within(self._process, seconds):
             return None
+        # Negative: it was still at it, has said nothing maybe, and was ended.
+        late = f" in {seconds:.0f} s" if self._process.returncode < 0 else ""
         return (
-            f"{self._where} could not be brought up to date; nothing is lost: `space-dist sync {self._folder}` "
+            f"{self._where} could not be brought up to date{late}; nothing is lost: `space-dist sync {self._folder}` "
             f"replays the {what} (details: {self._log_file})"
         )
 
