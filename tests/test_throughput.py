@@ -185,6 +185,8 @@ def test_an_ended_benchmark_leaves_no_process_behind(number: signal.Signals, tmp
         return found
 
     code = (
+        # A shell has what it starts in the background ignore SIGINT, and so what that starts.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "import runpy, sys; import benchmarks.throughput as t; t._missing = lambda: ['rllib', 'jax', 'sbx'];"
         "sys.argv = ['benchmark.py', 'throughput', '--only', 'pointmass', '--seconds', '600'];"
         f"runpy.run_path({str(ROOT / 'jobs/benchmark.py')!r}, run_name='__main__')"
