@@ -105,8 +105,10 @@ def read(folder: Path) -> Run:
     sizes = committed(folder)  # before the files: a run that goes on only adds to them
     config = YAML(typ="safe").load((folder / "config.yaml").read_text())
     settings = config["curriculum"]
-    if any(key.startswith("curriculum.") for change in config.get("schedule", ()) for key in change["set"]):
+    if any(key.partition(".")[0] == "curriculum" for change in config.get("schedule", ()) for key in change["set"]):
         raise NotAuditableError(f"{folder / 'config.yaml'}: schedule changes the curriculum's settings on the way")
+    if config.get("fork") is not None:
+        raise NotAuditableError(f"{folder / 'config.yaml'}: fork changes the seed on the way")
     with (folder / "instances_train.csv").open(newline="") as file:
         table = sorted(csv.DictReader(file), key=lambda row: int(row["id"]))
     scored = rows(folder / "values.jsonl", sizes)

@@ -19,6 +19,7 @@ from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedEr
 
 if TYPE_CHECKING:
     from space_dist.api.grids import GridRun, run_grid
+    from space_dist.api.headroom import measure_headroom
     from space_dist.api.policies import ActingPolicy, load_policy
     from space_dist.api.reports import ReportView, report_on
     from space_dist.api.training import Run, train
@@ -44,6 +45,7 @@ __all__ = [
     "SpaceDistError",
     "__version__",
     "load_policy",
+    "measure_headroom",
     "report_on",
     "run_grid",
     "run_search",
@@ -60,6 +62,7 @@ _HOMES = {
     "Run": "space_dist.api.training",
     "RunConfig": "space_dist.config",
     "load_policy": "space_dist.api.policies",
+    "measure_headroom": "space_dist.api.headroom",
     "report_on": "space_dist.api.reports",
     "run_grid": "space_dist.api.grids",
     "run_search": "space_dist.api.tuning",

@@ -23,6 +23,8 @@ MAX_FILE_BYTES: Final = 512 * 2**20
 MAX_LINE_BYTES: Final = 2**20  # some 40,000 features; a file without line ends never gets into memory whole
 MAX_INSTANCES: Final = 10_000_000
 MAX_ID: Final = 2**63 - 1
+PADDING_IDS: Final = 9 * 10**15
+"""From this id on, instances are padding: declared to be such that no policy can solve (`space_dist.envs.padding`)."""
 _BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
 _WIDE: Final = 1e300  # bounds where none are known
 
@@ -141,6 +143,12 @@ class InstanceSet:
     def __hash__(self) -> int:
         return hash((self.names, self.ids.tobytes(), self.contexts.tobytes()))
 
+    @property
+    def padding(self) -> NDArray[np.bool_]:
+        """`(n,)` which instances are declared to be such that no policy can solve."""
+        found: NDArray[np.bool_] = self.ids >= PADDING_IDS
+        return found
+
     def to_csv(self) -> str:
         r"""The one canonical text of this set: `id,<names>,<columns>`, by id, shortest round-trip floats, `\n` ends."""
         numbers = np.column_stack((self.contexts, *self.columns.values()))
@@ -244,6 +252,15 @@ def refuse_overlap(train: InstanceSet, test: InstanceSet, train_name: str, test_
         raise ConfigError(
             f"training and test instances overlap: {', '.join(pairs)}{more}. A policy must be tested "
             "on contexts it was not trained on"
+        )
+
+
+def refuse_padding(instances: InstanceSet, name: str) -> None:
+    """Raise ConfigError if a set holds instances that are declared to be such that no policy can solve."""
+    if count := int(instances.padding.sum()):
+        raise ConfigError(
+            f"{name}: {count} of {len(instances)} instances are padding, which no policy can solve (ids from "
+            f"{PADDING_IDS}); only training sets are padded"
         )
 
 

@@ -344,6 +344,21 @@ class WantsAdvantages(Honest):
     wants = Wants(advantages=True)
 
 
+class WantsSuccess(Honest):
+    wants = Wants(success=True)
+
+
+class LearnsNot(Honest):
+    """Has its first rounds played and not learned from, and has not said so before."""
+
+    def selection(self, state: Any) -> Any:
+        return dataclasses.replace(super().selection(state), learned=state.version > 2)
+
+
+class LooksFirst(LearnsNot):
+    wants = Wants(unlearned=True)
+
+
 class WantsInWords(Honest):
     wants = ("episodes",)
 

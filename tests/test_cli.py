@@ -425,12 +425,16 @@ def test_the_keys_of_grids_and_searches_are_explained(capsys: pytest.CaptureFixt
     _, grid, _ = run(capsys, "config", "schema", "--of", "grid")
     assert {f"  {key}:" in grid for key in ("name", "zip", "exclude", "retry.killed", "baseline")} == {True}
     _, search, _ = run(capsys, "config", "schema", "when", "--of", "search")
-    assert {line.split(":")[0].strip() for line in search.splitlines() if "dict" in line} == {"search.NAME.when", "arms.NAME.search.NAME.when"}  # fmt: skip
+    keys = {line.split(":")[0].strip() for line in search.splitlines() if "dict" in line}
+    assert keys == {"search.NAME.when", "arms.NAME.search.NAME.when"}
     code, _, said = run(capsys, "config", "schema", "retry")
     assert code == 2
     assert said.endswith("no key of a run has 'retry' in it; --of grid or --of search shows one that has\n")
     code, _, said = run(capsys, "config", "schema", "--of", "gird")
-    assert (code, said) == (2, "space-dist: --of 'gird' is not known; did you mean 'grid'? Allowed: run, grid, search\n")
+    assert (code, said) == (
+        2,
+        "space-dist: --of 'gird' is not known; did you mean 'grid'? Allowed: run, grid, search\n",
+    )
 
 
 def test_a_pipe_is_told_what_a_run_does(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

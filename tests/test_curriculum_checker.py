@@ -48,6 +48,8 @@ FAULTS = {
     "ProbesOutside": "probes() asks for index 40; the set has indices 0 to 39",
     "WantsEnsemble": "it wants the values of an ensemble, which is trained for curriculum.kind: vds alone",
     "WantsAdvantages": "it wants advantages, which are told by episode, and no episodes",
+    "WantsSuccess": "it wants success, which is told by episode, and no episodes",
+    "LearnsNot": "start() selects what shall not be learned from; say so before: set Wants(unlearned=True)",
     "WantsInWords": "its `wants` must be a space_dist.curricula.Wants, not a tuple",
     "LogsNaN": "step() logs mean_return = nan, which is no number: log None where there is none",
     "LogsArrays": "step() logs scores = an array of dtype float64",
@@ -69,7 +71,7 @@ def test_a_curriculums_fault_is_named(kind: str) -> None:
     assert FAULTS[kind] in fault, fault
 
 
-@pytest.mark.parametrize("kind", ["Honest", "Drawing", "Generates", "NeedsSuccess", "NeverChanges"])
+@pytest.mark.parametrize("kind", ["Honest", "Drawing", "Generates", "NeedsSuccess", "NeverChanges", "LooksFirst"])
 def test_without_fault(kind: str) -> None:
     findings = check(f"tests.faulty_curricula:{kind}", instances(), BOUNDS)
     assert findings.faults == []

@@ -43,7 +43,14 @@ KINDS = {
     "learnability": "{kind: learnability, top: 2, every: 2, episodes: 2}",
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
+    "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -1, smoothing: 0.5}",
+    "plr_max_mc": "{kind: plr, score: max_mc}",
+    "plr_robust": "{kind: plr, robust: true, temperature: 1, within_update: fixed_chances}",
+    "currot": "{kind: currot, delta: 0.5, particles: 12}",
+    "currot_bounds": "{kind: currot, delta: 0.5, particles: 12, over: bounds, target: normal, target_mean: [1, 0],"
+    " target_std: [0.1, 1]}",
     "manual": "{kind: manual, column: effort}",
+    "watched": "{kind: watched, iterations: 4, shares: 2}",
 }
 
 
@@ -117,8 +124,8 @@ def test_a_state_survives_storage_and_the_rows_of_the_file_decide_nothing(kind: 
 
 
 def test_every_kind_of_curriculum_is_covered() -> None:
-    # test_curricula, test_curriculum_variants, test_user_curriculum
-    known = {"space", "random_growth", "cspace", "round_robin", "fixed", "custom"}
+    # test_curricula, test_curriculum_variants, test_user_curriculum, test_causal
+    known = {"space", "random_growth", "cspace", "round_robin", "fixed", "custom", "replay"}
     covered = {configs.load(SPACE, [f"curriculum={text}"]).curriculum.kind for text in KINDS.values()}
     import typing
 

@@ -183,7 +183,7 @@ def test_a_job_server_that_wants_another_token_is_one_clear_sentence(
 
     from space_dist.grid import jobs
 
-    def refuse(address: str) -> None:
+    def refuse(_: str) -> None:
         raise AuthenticationError("Invalid authentication token")
 
     monkeypatch.setattr(jobs, "JobSubmissionClient", refuse)

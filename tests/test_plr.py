@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from pathlib import Path
@@ -16,12 +17,15 @@ from space_dist.curricula import (
     Draws,
     Feedback,
 )
-from space_dist.curricula.plr import LevelReplay, replay_chances, replayed
+from space_dist.curricula.plr import LevelReplay, Robust, replay_chances, replayed
+from space_dist.errors import ConfigError
+from space_dist.ledger import METRICS, VALUES, Ledger, decode_values
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout.episodes import mean_sizes
 from space_dist.run.launch import launch
 from space_dist.seeding import Purpose, generator
 from space_dist.system.interrupts import StopRequests
+from tests.test_every_curriculum import set_up
 from tests.test_rivals import SPACE, feedback, instances, tiny_shards, vds_config
 
 
@@ -181,6 +185,135 @@ def test_every_instance_is_begun_once_before_any_is_begun_again(
     for ended, running in begun:
         together = [*ended, *running]
         assert len(together) > 90 or len(set(together)) == len(together)  # the shards do not begin equally many
+
+
+# ---- max_mc, and robust ----------------------------------------------------------------------------------------------
+
+
+def plr(n: int = 6, **changes: Any) -> LevelReplay:
+    settings: dict[str, Any] = {"temperature": 1.0, "staleness_share": 0.0, "within_update": "fixed_chances"}
+    return LevelReplay(instances(n), seed=0, draws=Draws(12, 2), **{**settings, **changes})
+
+
+def told_returns(version: int, indices: list[int], returns: list[float], values: list[float]) -> Feedback:
+    whole = feedback(version, np.array(indices, dtype=np.int64), n=len(values))
+    assert whole.episodes is not None
+    episodes = dataclasses.replace(whole.episodes, discounted_returns=np.array(returns))
+    return dataclasses.replace(whole, episodes=episodes, values_after=np.array(values))
+
+
+def test_the_highest_return_less_the_value_by_hand() -> None:
+    made = plr(4, score="max_mc")
+    assert not made.wants.advantages
+    state, _ = made.start()
+    told = told_returns(0, [0, 1, 0, 2], [1.0, -3.0, 4.0, 2.0], [1.0, -2.0, 2.5, 9.0])
+    state, _, numbers = made.step(state, told)
+    assert state.best is not None
+    assert state.best.tolist() == [4.0, -3.0, 2.0, 0.0]  # of two episodes the better one; a loss is a loss
+    assert state.scores.tolist() == [3.0, -1.0, -0.5, 0.0]
+    # Ranks 1, 3 and 2 of those seen: 1, 1/3 and 1/2, whose sum is 11/6.
+    np.testing.assert_allclose(state.chances, [6 / 11, 2 / 11, 3 / 11, 0.0])
+    assert (numbers["largest_score"], numbers["seen"]) == (3.0, 3)
+    # A worse episode changes nothing, and values are those of now, whether or not an instance was played.
+    state, _, _ = made.step(state, told_returns(1, [0, 3], [1.0, 5.0], [3.75, -4.0, 1.0, 4.5]))
+    assert state.best is not None
+    assert state.best.tolist() == [4.0, -3.0, 2.0, 5.0]
+    assert state.scores.tolist() == [0.25, 1.0, 1.0, 0.5]
+    tied = sorted(state.chances.tolist(), reverse=True)
+    np.testing.assert_allclose(tied, [12 / 25, 6 / 25, 4 / 25, 3 / 25])
+    assert tied[2:] == [state.chances[3], state.chances[0]]
+
+
+@pytest.mark.parametrize("rule", ["without_repetition", "fixed_chances"])
+def test_robust_replay_explores_unlearned_and_replays_what_was_scored(rule: Any) -> None:
+    made = plr(6, robust=Robust(replay_share=0.5, scored_share=0.5), within_update=rule)
+    assert made.wants.unlearned
+    state, selection = made.start()
+    order = in_order(selection) - 10
+    # Nothing is scored: what was never begun first, then any; and nothing is learned from it.
+    assert (sorted(order[:6]), selection.learned) == (list(range(6)), False)
+    state, selection, numbers = made.step(state, feedback(0, order[:2], n=6, advantages=[1.0, 2.0], running=order[2:4]))
+    assert (selection.learned, numbers["learned"]) == (False, False)  # two of six are less than half
+    assert set(in_order(selection)[:2] - 10) == set(order[4:6])
+    state, selection, _ = made.step(state, feedback(1, order[2:3], n=6, advantages=3.0, running=order[3:4]))
+    learned = []
+    for version in range(2, 42):
+        again = made.selection(state)
+        assert (again.ids.tolist(), again.learned) == (selection.ids.tolist(), selection.learned)
+        learned.append(selection.learned)
+        drawn = in_order(selection) - 10
+        if selection.learned:  # of the scored ones alone
+            assert set(drawn) <= set(order[:3])
+        else:  # what was never begun, and then of all
+            assert drawn[:2].tolist() == order[4:6].tolist()
+            assert not set(drawn) <= set(order[:3])
+        state, selection, numbers = made.step(
+            state, feedback(version, order[:1], n=6, advantages=1.0, running=order[3:4])
+        )
+        assert numbers["learned"] == learned[-1]
+    assert 0.2 < np.mean(learned) < 0.8
+    always = plr(6, robust=Robust(replay_share=1.0, scored_share=0.5), within_update=rule)
+    assert all(always.selection(dataclasses.replace(state, version=version)).learned for version in range(40))
+
+
+def test_what_a_temperature_leaves_to_the_first_rank_of_a_hundred() -> None:
+    """The numbers of docs/curricula.md."""
+    shares = {}
+    for beta in (0.1, 0.3, 0.5, 1.0, 2.0):
+        weights = [rank ** (-1.0 / beta) for rank in range(1, 101)]
+        first = weights[0] / math.fsum(weights)
+        entropy = -math.fsum(one / math.fsum(weights) * math.log(one / math.fsum(weights)) for one in weights)
+        shares[beta] = (round(100 * first, 1), round(math.exp(entropy), 1))
+        chances = replay_chances(
+            np.arange(100.0), np.zeros(100, dtype=np.int64), np.ones(100, dtype=np.bool_),
+            np.arange(100, dtype=np.uint64), beta, 0.0,
+        )  # fmt: skip
+        assert chances.max() == pytest.approx(first)
+    assert shares == {0.1: (99.9, 1.0), 0.3: (87.2, 1.7), 0.5: (61.2, 4.8), 1.0: (19.3, 39.7), 2.0: (5.4, 84.4)}
+
+
+def test_a_round_that_is_looked_at_leaves_the_weights_and_tells_the_same_advantages() -> None:
+    trpo = "learner={kind: trpo, n_steps: 128, gamma: 0.5}"
+    for more in ("learner.normalize_rewards=true", "learner.update=lean", trpo):
+        config = vds_config("curriculum={kind: plr}", more)
+        (_, learner, shards), (_, twin, _) = tiny_shards(config), tiny_shards(config)
+        before = learner.scored()
+        seen = learner.look_at(shards, round=0)
+        after = learner.scored()
+        assert all(array.tobytes() == after[name].tobytes() for name, array in before.items())
+        assert (seen.gradient_steps, seen.metrics) == (0, {})
+        made = twin.update(shards, round=0, steps=128)
+        assert seen.advantages is not None
+        assert seen.advantages.tobytes() == made.advantages.tobytes()
+        assert learner.statistics.reward_std == twin.statistics.reward_std
+        assert any(array.tobytes() != after[name].tobytes() for name, array in twin.scored().items())
+
+
+def test_rounds_that_are_not_learned_from_are_charged_and_leave_the_weights(tmp_path: Path) -> None:
+    config = configs.load(SPACE, [
+        "curriculum={kind: plr, robust: true, score: max_mc, temperature: 1}", "learner.n_steps=512",
+        "learner.n_epochs=1", "learner.net_arch=[8]", "rollout.slots=4", "rollout.shards=1", "budget.steps=20480",
+        "evaluation.every_steps=100000", "tracking.uri=null", "resources.workers=0",
+    ])  # fmt: skip
+    launch(config, tmp_path / "run", resume=False, stop=StopRequests())
+    rows = [row for row in Ledger(tmp_path / "run").rows(METRICS) if row["kind"] == "iteration"]
+    assert [row["steps"] for row in rows] == [512 * number for number in range(1, 41)]
+    learned = [row["curriculum"]["learned"] for row in rows if row["complete"]]
+    assert not any(learned[:8])  # half of the hundred must be scored, by five or so an iteration
+    assert 4 < sum(learned) < 36
+    for row in rows[: len(learned)]:
+        assert (row["gradient_steps"] > 0) == row["curriculum"]["learned"]
+        assert (row["learner"] != {}) == row["curriculum"]["learned"]
+    values = [decode_values(row["after"]) for row in Ledger(tmp_path / "run").rows(VALUES)]
+    for number, some in enumerate(learned):
+        assert (values[number].tobytes() != values[number + 1].tobytes()) == some
+
+
+def test_rounds_cannot_be_left_unlearned_by_who_remembers_them() -> None:
+    dqn = ["env.id=tests.tiny_env:make_discrete", "learner={kind: dqn, n_steps: 2048}"]
+    with pytest.raises(ConfigError, match=r"plays rounds that are not learned from.*Allowed learners: ppo"):
+        set_up("curriculum={kind: plr, robust: true, score: max_mc}", *dqn)
+    set_up("curriculum={kind: plr, score: max_mc}", *dqn)  # which needs no advantages
 
 
 def test_replay_goes_on_where_no_episode_has_ended_yet() -> None:

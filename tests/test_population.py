@@ -40,6 +40,7 @@ def configured(folder: Path, number: int, **sections: Any) -> RunConfig:
     kind, own = learner.pop("kind", "ppo"), {"ppo": "clip_range", "trpo": "target_kl"}
     numbers = {"learning_rate": 1e-3 * (number + 1), "gamma": 0.9 - 0.05 * number, own[kind]: 0.1 + 0.05 * number}
     curricula = ({"kind": "space"}, {"kind": "round_robin"}, {"kind": "space", "kappa": 2, "eta": 0.5}, {"kind": "plr"})
+    curricula = sections.pop("curricula", curricula)
     config = config_for(
         folder, learner_section(kind, **{**numbers, **learner}),
         curriculum=curricula[number % len(curricula)], engine="population", seed=number, **sections,
@@ -87,6 +88,29 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
             assert results(folder) == expected[number]
             assert Ledger(folder).status().state == "done"
     assert len({content["metrics.jsonl"] for content in expected}) == 4
+
+
+DRAWING = (
+    {"kind": "procurl", "score": "improvement", "scale": "set"},
+    {"kind": "learning_progress", "smoothing": 0.5},
+    {"kind": "plr", "robust": True, "scored_share": 0.3, "temperature": 1.0},
+    {"kind": "plr", "robust": True, "scored_share": 0.3, "score": "max_mc", "within_update": "fixed_chances"},
+    {"kind": "currot", "delta": -1.0, "particles": 8, "over": "bounds"},
+)
+
+
+@pytest.mark.parametrize("kind", ["ppo", "trpo"])
+def test_members_that_draw_are_what_their_runs_are_alone(kind: str, tmp_path: Path) -> None:
+    """Some of them learn from no round, while others wait for their update."""
+    configs = [configured(tmp_path / str(number), number, learner={"kind": kind}, curricula=DRAWING,
+                          budget={"steps": 9 * N_STEPS}) for number in range(len(DRAWING))]  # fmt: skip
+    expected = [alone(config, tmp_path / f"alone{number}") for number, config in enumerate(configs)]
+    folders = [tmp_path / f"run{number}" for number in range(len(DRAWING))]
+    assert all(isinstance(end, Outcome) for end in together(configs, folders).values())
+    assert [results(folder) for folder in folders] == expected
+    for folder in folders[2:4]:
+        learned = {row["gradient_steps"] > 0 for row in Ledger(folder).rows() if row["kind"] == "iteration"}
+        assert learned == {False, True}
 
 
 def test_members_that_stay_together_play_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,8 @@ from PIL import Image, ImageSequence
 
 from space_dist import config as configs
 from space_dist.envs import make_batched
-from space_dist.envs.layouts import carve
+from space_dist.envs.layouts import carve, placed
+from space_dist.envs.mixed_maze import draw
 from space_dist.errors import ConfigError
 from space_dist.instances import InstanceSet
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Ledger, RunWriter, Status
@@ -141,6 +142,40 @@ def test_a_pole_is_as_long_as_its_context_says(tmp_path: Path) -> None:
                    for path, _ in written)  # fmt: skip
     assert 3.0 < long / short < 5.5
     assert (np.abs(frames(written[0][0])[-1].astype(int) - RED) < 25).all(axis=2).any()  # fell
+
+
+def test_a_walk_up_the_corridor_is_drawn(tmp_path: Path) -> None:
+    """The policy always goes up: to the first goal, and past the others."""
+    contexts = np.array([[-6.0, 6.0, 3.0], [6.0, 6.0, 0.5], [0.0, 0.0, 1.0], [-9.0, -9.0, 0.05]])
+    ledger = run_of(tmp_path / "run", "space_dist/GoalMaze-v0", contexts[:2], contexts[2:], bias=[0.0, 5.0],
+                    kwargs={"horizon": 60})  # fmt: skip
+    written = draw_run(ledger, tmp_path / "pictures", [0, 1])
+    assert "train instance 0: return 1, success" in written[0][1]
+    assert "train instance 1: return 0, no success, 60 steps" in written[1][1]
+    shown = frames(written[1][0])
+    columns, rows = zip(*(centre(frame, BLUE) for frame in shown), strict=True)
+    assert np.ptp(columns) < 0.03
+    assert rows[0] > rows[5] > rows[20] > rows[-1]
+    dark = (shown[0].max(axis=2) < 60).mean()
+    assert 0.3 < dark < 0.7  # the block and what is outside of the walls
+    assert [path.name for path, _ in written[2:]] == ["trajectories_train.png", "trajectories_test.png"]
+
+
+def test_a_small_maze_fills_its_picture(tmp_path: Path) -> None:
+    """Of side 3, a corridor east and then south; the policy always goes east."""
+    layout = np.zeros((1, 9))
+    layout[0, [0, 1, 2, 5]] = [2.0, 2.0, 4.0, 4.0]
+    small = np.column_stack(([3.0], placed(layout, 11)))
+    others = draw(np.random.default_rng(0), 3)
+    ledger = run_of(tmp_path / "run", "space_dist/MixedMaze-v0", np.vstack([small, others[:1]]), others[1:],
+                    bias=[0.0, 0.0, 5.0, 0.0], kwargs={"horizon": 8})  # fmt: skip
+    written = draw_run(ledger, tmp_path / "pictures", [0])
+    assert written[0][1] == "train instance 0: return -0.08889 of 0.9667, no success, 8 steps"
+    columns = [centre(frame, BLUE)[0] for frame in frames(written[0][0])]
+    assert columns[0] < 0.25
+    assert columns[0] < columns[1] < columns[2]
+    assert columns[2] > 0.45  # on the way from the left to the right wall
+    assert [path.name for path, _ in written[1:]] == ["trajectories_train.png", "trajectories_test.png"]
 
 
 def test_an_environment_that_draws_itself(tmp_path: Path) -> None:

@@ -356,6 +356,26 @@ def test_procurls_control_goes_by_what_values_have_risen() -> None:
         np.testing.assert_allclose(found, weights / weights.sum())
 
 
+@pytest.mark.parametrize("scale", ["largest", "set"])
+def test_its_control_is_what_its_authors_call_space_alt(scale: Any) -> None:
+    """Their rule, decision for decision: weights exp(20 (u - u_before)), u the values over the largest return, or the
+    rises themselves from 0 for the least to 1 for the greatest."""
+    values = [[0.1, 0.0, -0.2, 0.3, 1.0], [0.2, 0.0, 0.1, 0.1, 1.1], [0.9, 0.4, 0.1, 0.2, 1.0]]
+    made = Proximal(instances(5), seed=0, draws=Draws(20, 2), beta=20.0, score="improvement", scale=scale, largest=2.0)
+    state, before = made.start()[0], [0.0, 0.05, -0.1, 0.0, 0.5]
+    for version, after in enumerate(values):
+        told = dataclasses.replace(
+            feedback(version, [0], n=5), values_before=np.array(before), values_after=np.array(after)
+        )
+        state, _, _ = made.step(state, told)
+        rises = [(new - old) / 2.0 if scale == "largest" else new - old for new, old in zip(after, before, strict=True)]
+        if scale == "set":
+            rises = [(rise - min(rises)) / (max(rises) - min(rises)) for rise in rises]
+        weights = [math.exp(20.0 * rise) for rise in rises]
+        assert state.chances.tolist() == pytest.approx([weight / math.fsum(weights) for weight in weights])
+        before = after
+
+
 def test_large_values_do_not_overflow() -> None:
     assert np.isfinite(softmax(np.array([0.0, 1e5]), 20.0)).all()
 

@@ -84,6 +84,17 @@ FACTS: dict[str, dict[str, Any]] = {
         "curriculum.n_batches": 100,
     },
     "curricula/pointmass_plr": RIVALS,
+    "curricula/pointmass_plr_robust": {
+        **RIVALS, "curriculum.replay_share": 0.5, "curriculum.scored_share": 0.5, "curriculum.staleness_share": 0.3,
+        "curriculum.robust": True,
+    },
+    "curricula/pointmass_space_alt": {**RIVALS, "curriculum.score": "improvement", "curriculum.beta": 20.0},
+    "curricula/pointmass_learning_progress": {
+        **RIVALS, "curriculum.smoothing": 0.1, "curriculum.theta": 0.1, "curriculum.uniform_share": 0.25,
+    },
+    "curricula/pointmass_currot": {
+        **RIVALS, "curriculum.delta": 4.0, "curriculum.particles": 100, "curriculum.performance": "discounted_return",
+    },
     "curricula/pointmass_learnability": {**RIVALS, "curriculum.uniform_share": 0.5},
     "curricula/pointmass_uniform": RIVALS,
     "pointmass_space": {**RIVALS, "curriculum.eta": 0.4, "curriculum.kappa": 16, "budget.steps": 1_000_000},

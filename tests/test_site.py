@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -34,6 +35,7 @@ from space_dist import cli, config
 from space_dist.config.shipped import located
 from space_dist.experiment.manifest import GridConfig, load_grid
 from space_dist.experiment.tuning import TuneConfig, is_search
+from space_dist.grid.forking import change_of
 from space_dist.slurm.profile import load_profile
 from tests.commanding import command
 
@@ -44,6 +46,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 ELSEWHERE = {  # whose blocks a test runs from the first to the last
     "python.md": "test_python.py", "sb3.md": "test_sb3.py", "your_environment.md": "test_user_env.py",
     "your_curriculum.md": "test_user_curriculum.py", "your_learner.md": "test_user_learner.py",
+    "causes.md": "test_headroom.py",
 }  # fmt: skip
 SMALL = (
     "budget.steps=1024", "evaluation.every_steps=1024", "learner.n_steps=512", "learner.batch_size=64",
@@ -199,6 +202,10 @@ def settings(name: str, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch)
     overrides = [number(one) for one in values.get("overrides") or values.get("set") or ()]
     if name == "slurm":
         load_profile(values.get("profile"), overrides)
+    elif name == "fork":
+        for override in overrides:
+            change = {"steps": values["at"], "set": change_of(override)}
+            config.load(ROOT / "configs/sparse_pointmass_procurl.yaml", [f"schedule={json.dumps([change])}"])
     elif overrides:
         given = Path(str(values["config"]))
         config.load(located(given) if list(ROOT.glob(str(given))) or "shipped:" in str(given) else

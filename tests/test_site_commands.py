@@ -106,7 +106,7 @@ def test_training(shell: Shell) -> None:
     assert "my_instances" in instances
 
 
-@executes(("training.md", 3), ("environments.md", 3), ("environments.md", 4))
+@executes(("training.md", 3), ("environments.md", 4), ("environments.md", 5))
 def test_ones_own_environment(shell: Shell) -> None:
     """The package that the page calls my_package has the environment of docs/your_environment.md."""
     package = shell.folder / "my_package"
@@ -115,8 +115,8 @@ def test_ones_own_environment(shell: Shell) -> None:
     shell.run("space-dist train configs/pointmass_space.yaml --out runs/my_run/s0")  # which can be drawn
     shell.block("training.md", 3)
     assert len(list((shell.folder / "pictures").glob("*.gif"))) == 3
-    shell.block("environments.md", 3, {"--out sets": "--out carl_sets"})
-    shell.block("environments.md", 4, prelude=WITHOUT)
+    shell.block("environments.md", 4, {"--out sets": "--out carl_sets"})
+    shell.block("environments.md", 5, prelude=WITHOUT)
 
 
 @executes(("installing.md", 0), ("installing.md", 1))
@@ -132,7 +132,7 @@ def test_installing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (shell.folder / "my_configs/grids/quickstart.yaml").is_file()
 
 
-@executes(("environments.md", 0), ("environments.md", 1), ("environments.md", 2), ("environments.md", 5))
+@executes(*(("environments.md", number) for number in (0, 1, 2, 3, 6)))
 def test_environments(shell: Shell) -> None:
     shell.block("environments.md", 0)
     shell.block("environments.md", 1, {"for seed in 0 1 2": "for seed in 0"})
@@ -142,7 +142,9 @@ def test_environments(shell: Shell) -> None:
     evaluated = [words[2] for words in shell.typed if words[1] == "evaluate"]
     assert len(evaluated) == 3
     assert len({*evaluated}) == 2
-    shell.block("environments.md", 5)
+    shell.block("environments.md", 3)
+    assert len((shell.folder / "my_padded_train.csv").read_text().splitlines()) == 1 + 100 + 100
+    shell.block("environments.md", 6)
     assert len(list((shell.folder / "pictures").glob("*.gif"))) == 3
 
 

@@ -158,10 +158,10 @@ def test_jaxs_point_masses_go_where_ours_do() -> None:
     body = np.tile(START, (slots, 1)).astype(np.float32)
     state, going = jitted.State(body, contexts, np.zeros(slots, np.int32)), np.ones(slots, dtype=bool)
     crashed, truncated, jitted_step = 0, 0, jax.jit(jitted.step)
-    for time in range(ours.horizon):
+    for moment in range(ours.horizon):
         actions = random.uniform(-12.0, 6.0, (slots, 2)).astype(np.float32)
         step = ours.step(actions)
-        state, rewards, crashes, ends = jitted_step(state, actions, noise[:, time].astype(np.float32))
+        state, rewards, crashes, ends = jitted_step(state, actions, noise[:, moment].astype(np.float32))
         np.testing.assert_array_equal(np.asarray(crashes)[going], step.terminated[going])
         np.testing.assert_array_equal(np.asarray(ends)[going], step.truncated[going])
         np.testing.assert_allclose(np.asarray(rewards)[going], step.rewards[going], atol=1e-3)

@@ -69,7 +69,8 @@ def checkpoint(
 
 def _seconds(name: str, settings: list[str]) -> tuple[float, int, float]:
     """Wall seconds of a run, its commits, and the wall seconds that they took, encoding included."""
-    from space_dist.run.training import Training, Work
+    from space_dist.run.requests import Work
+    from space_dist.run.training import Training
 
     spent: list[float] = []
     commit = Training._commit

@@ -152,7 +152,7 @@ def as_config(
     if isinstance(overrides, Mapping):
         for key, value in configs.plain(_without_numpy(overrides), "overrides").items():
             origins[key] = f"overrides[{key!r}]"
-            configs.put(data, key, _from_here(key, value), origins[key])
+            configs.put(data, key, configs.from_folder(key, value, Path.cwd()), origins[key])
     else:
         for override in overrides:
             configs.apply_override(data, override)
@@ -162,12 +162,6 @@ def as_config(
             configs.put(data, key, _without_numpy(given), source)
             origins[key] = key.rpartition(".")[2]
     return configs.parse(data, source, origins)
-
-
-def _from_here(key: str, value: Any) -> Any:
-    if key.partition(".")[0] not in ("instances", "init_from"):
-        return value
-    return configs.from_folder(value, Path.cwd()) if isinstance(value, dict) else configs.beside(value, Path.cwd())
 
 
 def _without_numpy(value: Any) -> Any:

@@ -12,7 +12,7 @@ import typer
 
 from space_dist import __version__
 from space_dist.arithmetic import overruled
-from space_dist.cli import runs, starting
+from space_dist.cli import evidence, runs, starting
 from space_dist.cli.curricula import curriculum_app
 from space_dist.cli.grids import grid_app
 from space_dist.cli.health import doctor
@@ -30,7 +30,7 @@ app = typer.Typer(
 )  # fmt: skip
 for _command in (
     starting.init, starting.configs, runs.train, runs.evaluate, runs.explain, runs.report, runs.sync, runs.export_sb3,
-    render, doctor,
+    evidence.fork, evidence.headroom, render, doctor,
 ):  # fmt: skip
     app.command()(_command)
 app.add_typer(grid_app, name="grid")

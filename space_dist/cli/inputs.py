@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 from rich.markup import escape
@@ -13,6 +13,9 @@ from rich.table import Table
 
 from space_dist.cli.terminal import Kwargs, Overrides, console, delivered, parse_kwargs, say, write
 from space_dist.errors import ConfigError, about, nearest
+
+if TYPE_CHECKING:
+    from space_dist.instances import InstanceSet
 
 SchemaRow = tuple[str, str, str, str]  # key, type, default, explanation
 
@@ -48,6 +51,35 @@ def instances_sample(
         say(f"{path}: {len(chosen)} instances")
 
 
+@instances_app.command("pad")
+def instances_pad(
+    file: Annotated[Path, typer.Argument(metavar="SET.csv", help="A training set.")],
+    share: Annotated[float, typer.Option(help="How much of the padded set cannot be solved, between 0 and 1.")],
+    out: Annotated[Path, typer.Option(help="The CSV file to write.")],
+    env: Annotated[str, typer.Option(help="The environment whose contexts these are.")],
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    kwarg: Kwargs = None,
+) -> None:
+    """Add instances that no policy can solve, as the environment draws them, until they are a share of the set."""
+    from space_dist.config import located
+    from space_dist.envs.padding import pad
+    from space_dist.envs.spec import read_spec
+    from space_dist.instances import PADDING_IDS, read_csv
+
+    if out.exists():
+        raise ConfigError(f"{out} exists; choose another --out, or remove it")
+    kwargs = parse_kwargs(kwarg)
+    bounds = read_spec(env, context_visible=False, kwargs=kwargs).context_bounds
+    padded = pad(read_csv(located(file), bounds), share, seed, env, kwargs)
+    write(out, padded.to_csv())
+    say(f"{out}: {len(padded)} instances, {_padding(padded)} (ids from {PADDING_IDS})")
+
+
+def _padding(instances: InstanceSet) -> str:
+    count = int(instances.padding.sum())
+    return f"{count} of them padding that no policy can solve: a share of {count / len(instances):.4g}"
+
+
 @instances_app.command("check")
 def instances_check(
     files: Annotated[list[Path], typer.Argument(help="CSV files; given two, they must not share a context.")],
@@ -81,7 +113,8 @@ def instances_check(
         for other in range(index):
             refuse_overlap(sets[other], one, str(files[other]), str(files[index]))
     for file, one in zip(files, sets, strict=True):
-        table = Table(title=f"{file}: {len(one)} instances")
+        padding = f", {_padding(one)}" if one.padding.any() else ""
+        table = Table(title=f"{file}: {len(one)} instances{padding}")
         for name in ("feature", "least", "mean", "greatest", "bounds"):
             table.add_column(name, justify="left" if name == "feature" else "right")
         for row, low, high in zip(summary(one, bounds), bounds.low, bounds.high, strict=True):

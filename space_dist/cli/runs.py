@@ -93,7 +93,7 @@ def evaluate(
     config = stored_config(ledger)
     spec = spec_of(config)
     policies = policies_of(policy_of(ledger, spec))
-    chosen = read_csv(located(instances), spec.context_bounds, config.curriculum.columns_read, if_there=True)
+    chosen = read_csv(located(instances), spec.context_bounds, config.columns_read, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     optimum = None
     with exits_refused(), spec.opened(len(chosen)) as env:
@@ -145,7 +145,7 @@ def explain(
     config = stored_config(ledger)
     ledger.read(ledger.instances("train"))
     bounds = spec_of(config).context_bounds
-    train = read_csv(ledger.instances("train"), bounds, config.curriculum.columns_read)
+    train = read_csv(ledger.instances("train"), bounds, config.columns_read)
     for line in explain_decision(ledger, config, bounds, train, iteration):
         print(line)
     delivered()

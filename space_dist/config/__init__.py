@@ -13,24 +13,32 @@ Each imports from those below it.
 from __future__ import annotations
 
 from space_dist.config.curriculum import (
-    AlpGmmConfig,
-    ContextSpaceConfig,
     CurriculumConfig,
     CustomConfig,
-    FixedConfig,
-    GrowingConfig,
+    ReplayConfig,
+    WatchedConfig,
+)
+from space_dist.config.drawing import (
+    AlpGmmConfig,
     LearnabilityConfig,
+    LearningProgressConfig,
     LevelReplayConfig,
-    ManualConfig,
     ProximalConfig,
-    RandomGrowthConfig,
-    RoundRobinConfig,
     SelfPacedConfig,
-    SpaceConfig,
+    TransportConfig,
     UniformConfig,
     ValueDisagreementConfig,
 )
 from space_dist.config.explaining import schema
+from space_dist.config.growing import (
+    ContextSpaceConfig,
+    FixedConfig,
+    GrowingConfig,
+    ManualConfig,
+    RandomGrowthConfig,
+    RoundRobinConfig,
+    SpaceConfig,
+)
 from space_dist.config.identities import NOT_IDENTITY, changes, differences, flattened, identity
 from space_dist.config.learner import (
     A2CConfig,
@@ -94,6 +102,7 @@ __all__ = [
     "InstancesConfig",
     "LearnabilityConfig",
     "LearnerConfig",
+    "LearningProgressConfig",
     "LevelReplayConfig",
     "ManualConfig",
     "Mirrors",
@@ -101,6 +110,7 @@ __all__ = [
     "Patience",
     "ProximalConfig",
     "RandomGrowthConfig",
+    "ReplayConfig",
     "ResourcesConfig",
     "RolloutConfig",
     "RoundRobinConfig",
@@ -112,8 +122,10 @@ __all__ = [
     "TD3Config",
     "TRPOConfig",
     "TrackingConfig",
+    "TransportConfig",
     "UniformConfig",
     "ValueDisagreementConfig",
+    "WatchedConfig",
     "about_shipped",
     "apply_override",
     "beside",

@@ -14,20 +14,18 @@ NOT_IDENTITY = ("name", "checkpoint", "tracking", "resources")  # what cannot ch
 
 
 def identity(
-    config: RunConfig, train_digest: str, test_digest: str, *, weights: bytes | None = None,
+    config: RunConfig, train_digest: str, test_digest: str, *, given: Mapping[str, bytes] = MappingProxyType({}),
     sources: Mapping[str, str] = MappingProxyType({}), with_seed: bool = True,
 ) -> str:  # fmt: skip
     """`(64 hex digits)` a hash of everything that decides the run's results; without its seed, that of a grid's cell.
 
-    Instance files count by their content, and so do the `weights` that `init_from` names, and a user's own code:
+    Instance files count by their content, and so does what other runs have `given`, by its key, and a user's own code:
     `sources`, by import path. Fields at their default are left out, so that a field that is added later changes no
     identity.
     """
-    exclude = {*NOT_IDENTITY, "seed", "init_from"}
-    data = config.model_dump(mode="json", exclude=exclude, exclude_defaults=True)
+    data = config.model_dump(mode="json", exclude=_without("seed"), exclude_defaults=True)
     data["instances"] = {"train": train_digest, "test": test_digest}
-    if weights is not None:
-        data["init_from"] = hashlib.sha256(weights).hexdigest()
+    data |= {key: hashlib.sha256(content).hexdigest() for key, content in given.items()}
     if sources:
         data["sources"] = dict(sources)
     if with_seed:
@@ -38,9 +36,14 @@ def identity(
 
 def differences(one: RunConfig, other: RunConfig) -> list[str]:
     """`key: value -> value` for every key that decides results and differs; paths are left out."""
-    exclude = {*NOT_IDENTITY, "instances", "init_from"}
+    exclude = _without("instances")
     changed = changes(one.model_dump(mode="json", exclude=exclude), other.model_dump(mode="json", exclude=exclude))
     return [f"{key}: {before} -> {after}" for key, (before, after) in changed.items()]
+
+
+def _without(*more: str) -> dict[str, Any]:
+    """What of a config says nothing about what it is, as pydantic excludes it: paths among it."""
+    return {**dict.fromkeys((*NOT_IDENTITY, "init_from", *more), True), "curriculum": {"of"}}
 
 
 def changes(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

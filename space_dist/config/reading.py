@@ -48,16 +48,17 @@ def read(path: Path) -> dict[str, Any]:
 
 def from_its_folder(data: dict[str, Any], folder: Path) -> None:
     """Take the relative paths in a run's plain data from `folder`."""
-    if "init_from" in data:
-        data["init_from"] = beside(data["init_from"], folder)
-    instances = data.get("instances")
-    if isinstance(instances, dict):
-        data["instances"] = from_folder(instances, folder)
+    data |= {key: from_folder(key, value, folder) for key, value in data.items()}
 
 
-def from_folder(instances: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The `instances` section with its relative paths taken from `folder`."""
-    return {key: beside(value, folder) for key, value in instances.items()}
+def from_folder(key: str, value: Any, folder: Path) -> Any:
+    """The value of a config's key, the relative paths in it taken from `folder`."""
+    if key == "instances" and isinstance(value, dict):
+        return {name: beside(path, folder) for name, path in value.items()}
+    if key == "curriculum" and isinstance(value, dict) and "of" in value:
+        return {**value, "of": beside(value["of"], folder)}
+    is_path = key in ("init_from", "curriculum.of") or key.partition(".")[0] == "instances"
+    return beside(value, folder) if is_path else value
 
 
 def beside(value: Any, folder: Path) -> Any:
@@ -105,18 +106,10 @@ def apply_override(data: dict[str, Any], override: str) -> None:
         raise ConfigError(f"{told(repr(override))}: write KEY=VALUE, like --set budget.steps=20000")
     value = parse_yaml(text, told(override))
     # Who types a path at a prompt means it from where they stand, and not from the config's folder.
-    if parts[0] in ("instances", "init_from"):
-        value = _from_here(value)
-    put(data, ".".join(parts), value, told(override))
+    name = ".".join(parts)
+    put(data, name, from_folder(name, value, Path.cwd()), told(override))
 
 
 def told(override: str) -> str:
     """An override as sentences name it: without the credentials of a URI."""
     return f"--set {_CREDENTIALS.sub('//...@', override)}"
-
-
-def _from_here(value: Any) -> Any:
-    """Paths of an override, relative to the current folder, as absolute ones."""
-    if isinstance(value, dict):
-        return {key: _from_here(item) for key, item in value.items()}
-    return beside(value, Path.cwd())

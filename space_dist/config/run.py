@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
@@ -26,9 +28,9 @@ from space_dist.errors import nearest
 CHANGEABLE: Final = (
     "learner.learning_rate", "learner.gamma", "learner.gae_lambda", "learner.batch_size", "learner.n_epochs",
     "learner.clip_range", "learner.ent_coef", "learner.vf_coef", "learner.max_grad_norm", "learner.target_kl",
-    "curriculum.eta", "curriculum.kappa",
+    "curriculum.eta", "curriculum.kappa", "curriculum",
 )  # fmt: skip
-"""What may change on the way: numbers that no array of a checkpoint has its shape by."""
+"""What may change on the way: numbers that no array of a checkpoint has its shape by, and the curriculum as a whole."""
 
 
 class Change(Section):
@@ -37,7 +39,8 @@ class Change(Section):
     steps: int = Field(ge=1)
     """They are in force from the first update at or behind so many environment steps."""
     set: dict[str, Any]
-    """Config keys and values: numbers of the learner's and of SPaCE's that decide no shape."""
+    """Config keys and values: numbers of the learner's and of SPaCE's that decide no shape; or `curriculum`, a whole
+    section, which begins anew."""
 
     @field_validator("set")
     @classmethod
@@ -50,6 +53,20 @@ class Change(Section):
                     f"{key} cannot change on the way{nearest(key, CHANGEABLE)} Allowed: {', '.join(CHANGEABLE)}"
                 )
         return given
+
+    @property
+    def replaces_curriculum(self) -> bool:
+        """Whether another curriculum comes into force, which begins anew."""
+        return "curriculum" in self.set
+
+
+class Fork(Section):
+    """A part of the run that another run shares: a continuation of what that has learned."""
+
+    seed: int = Field(ge=0, le=2**31 - 1)
+    """Of that run: every random number comes from it until then."""
+    steps: int = Field(ge=1)
+    """The run's own seed is in force from the first update at or behind so many environment steps."""
 
 
 class RunConfig(Section):
@@ -82,6 +99,8 @@ class RunConfig(Section):
     budget: BudgetConfig
     schedule: tuple[Change, ...] = Field(default=(), max_length=1000, strict=False)
     """Settings that change on the way: a list, by steps, ascending; such as population-based training finds."""
+    fork: Fork | None = None
+    """How far the run is the same as one of another seed. null: it has its own from its start."""
     evaluation: EvaluationConfig = EvaluationConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     tracking: TrackingConfig = TrackingConfig()
@@ -196,30 +215,68 @@ class RunConfig(Section):
             getattr(self.curriculum, "adaptive_eta", "off") == "persistent"
         ):
             raise ValueError("schedule: curriculum.eta says nothing once adaptive_eta: persistent has raised it")
+        if self.fork is not None and self.fork.steps >= self.budget.steps:
+            raise ValueError(f"fork.steps = {self.fork.steps} is not below budget.steps = {self.budget.steps}")
         for place, change in enumerate(self.schedule):
             try:
-                self.at(change.steps)
+                found = self.at(change.steps)
             except ValidationError as error:
                 fault = error.errors(include_url=False)[0]
                 where = ".".join(str(part) for part in fault["loc"] if part not in (self.learner.kind,))
-                raise ValueError(f"schedule.{place}: {where}: {fault['msg']}") from None
+                what = fault["msg"]
+                if fault["type"] == "union_tag_invalid":
+                    known = re.findall(r"'(\w+)'", str(fault["ctx"]["expected_tags"]))
+                    tag = str(fault["ctx"]["tag"])
+                    what = f"kind: {tag!r} is not known{nearest(tag, known)} Allowed: {', '.join(known)}"
+                raise ValueError(f"schedule.{place}: {where}: {what}") from None
+            if change.replaces_curriculum and found.n_policies != self.n_policies:
+                raise ValueError(f"schedule.{place}: curriculum.aggregate: the number of policies cannot change")
+            if change.replaces_curriculum and "curriculum.of" in found.given_paths:
+                raise ValueError(f"schedule.{place}: curriculum.kind: replay follows a run from its start")
         return self
 
     def at(self, steps: int) -> RunConfig:
-        """The config in force from the first update at or behind so many steps on: one without a schedule."""
-        if not self.schedule:
+        """The config in force from the first update at or behind so many steps on: one that stays as it is."""
+        if not self.changes:
             return self
-        data = self.model_dump(exclude={"schedule"})
+        data = self.model_dump(exclude={"schedule", "fork"})
+        if self.fork is not None and steps < self.fork.steps:
+            data["seed"] = self.fork.seed
         for change in self.schedule:
             if change.steps <= steps:
                 for key, value in change.set.items():
                     section, _, name = key.partition(".")
-                    data[section] = {**data[section], name: value}
+                    data[section] = {**data[section], name: value} if name else value
         return RunConfig.model_validate(data)
+
+    @property
+    def changes(self) -> tuple[int, ...]:
+        """The steps at which something changes on the way, ascending."""
+        return tuple(sorted({*(change.steps for change in self.schedule), *([self.fork.steps] if self.fork else ())}))
 
     def change_after(self, steps: int) -> int:
         """The steps of the next change behind so many; 0: there is none."""
-        return next((change.steps for change in self.schedule if change.steps > steps), 0)
+        return next((change for change in self.changes if change > steps), 0)
+
+    def curriculum_number(self, steps: int) -> int:
+        """How many curricula were in force before the one that is, from the first update at or behind so many steps."""
+        return sum(change.replaces_curriculum for change in self.schedule if change.steps <= steps)
+
+    @property
+    def curricula(self) -> tuple[CurriculumConfig, ...]:
+        """All that come into force, in order."""
+        later = (self.at(change.steps).curriculum for change in self.schedule if change.replaces_curriculum)
+        return (self.curriculum, *later)
+
+    @property
+    def columns_read(self) -> tuple[str, ...]:
+        """Columns of the training instances' CSV that its curricula read, beside id and features."""
+        return tuple(dict.fromkeys(column for one in self.curricula for column in one.columns_read))
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose arithmetic the decisions of its curricula depend on, beside NumPy."""
+        return tuple(dict.fromkeys(library for one in self.curricula for library in one.libraries))
 
     @property
     def n_policies(self) -> int:
@@ -227,10 +284,24 @@ class RunConfig(Section):
         return self.curriculum.policies_trained
 
     @property
+    def given_paths(self) -> dict[str, Path]:
+        """What is taken from other runs: the folder, or the copy of what counts of it, by the key that names it."""
+        paths = {"init_from": self.init_from, "curriculum.of": getattr(self.curriculum, "of", None)}
+        return {key: path for key, path in paths.items() if path is not None}
+
+    def with_given(self, paths: Mapping[str, Path]) -> RunConfig:
+        """The same with other paths to what is taken from other runs."""
+        changed: dict[str, Any] = {key: path for key, path in paths.items() if key == "init_from"}
+        if "curriculum.of" in paths:
+            changed["curriculum"] = self.curriculum.model_copy(update={"of": paths["curriculum.of"]})
+        return self.model_copy(update=changed)
+
+    @property
     def import_paths(self) -> tuple[str, ...]:
         """What names code of somebody's own, which results depend on: environment, policy, learner and curriculum."""
         of_env = (self.env.id,) if ":" in self.env.id else ()
-        return (*of_env, *self.learner.import_paths, *self.curriculum.import_paths)
+        of_curricula = dict.fromkeys(path for one in self.curricula for path in one.import_paths)
+        return (*of_env, *self.learner.import_paths, *of_curricula)
 
     @property
     def n_episodes(self) -> int | None:

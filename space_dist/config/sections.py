@@ -223,3 +223,42 @@ class ResourcesConfig(Patience):
         if isinstance(value, int) and not 0 <= value <= _MAX_WORKERS:
             raise ValueError(f"must be from 0 to {_MAX_WORKERS}, or auto")
         return value
+
+
+class CurriculumSection(Section):
+    """A curriculum's settings, and what a run must know of it."""
+
+    @property
+    def ranks_by_start_value(self) -> bool:
+        """Whether it makes no sense where the policy cannot tell instances apart at their start."""
+        return False
+
+    @property
+    def starts_from_zero(self) -> bool:
+        """Whether start values before the first update count as 0."""
+        return False
+
+    @property
+    def policies_trained(self) -> int:
+        """How many policies share the selection."""
+        return 1
+
+    @property
+    def may_probe(self) -> bool:
+        """Whether it may run probe episodes, whose steps cannot be foreseen."""
+        return False
+
+    @property
+    def columns_read(self) -> tuple[str, ...]:
+        """Columns of the training instances' CSV that it reads, beside id and features."""
+        return ()
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose arithmetic its decisions depend on, beside NumPy."""
+        return ()
+
+    @property
+    def import_paths(self) -> tuple[str, ...]:
+        """Import paths of what somebody else has written."""
+        return ()

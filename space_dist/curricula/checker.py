@@ -86,7 +86,7 @@ class _Check:
     def run(self) -> None:
         self._check_start()
         self._note_habits(self._check_history())
-        if self._wants.episodes and not self._wants.probes:
+        if self._wants.episodes and not self._wants.probes and not self._wants.success:
             self._try_without_success()
 
     # ---- the checks ----

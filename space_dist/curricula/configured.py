@@ -14,31 +14,39 @@ from space_dist.config import (
     CustomConfig,
     FixedConfig,
     LearnabilityConfig,
+    LearningProgressConfig,
     LevelReplayConfig,
     ManualConfig,
     ProximalConfig,
     RandomGrowthConfig,
+    ReplayConfig,
     RoundRobinConfig,
     SelfPacedConfig,
     SpaceConfig,
+    TransportConfig,
     UniformConfig,
     ValueDisagreementConfig,
+    WatchedConfig,
 )
 from space_dist.curricula import variants
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
-from space_dist.curricula.plr import LevelReplay
+from space_dist.curricula.learning_progress import LearningProgress
+from space_dist.curricula.plr import LevelReplay, Robust
 from space_dist.curricula.procurl import Proximal
+from space_dist.curricula.replay import Recording, Replay
 from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
 from space_dist.curricula.vds import ValueDisagreement
+from space_dist.curricula.watching import Watched
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
 
 if TYPE_CHECKING:  # SciPy takes half a second to import, and few curricula need it
     from space_dist.curricula.alp_gmm import AlpGmm
+    from space_dist.curricula.currot import Transport
     from space_dist.curricula.gaussian import Gaussian
     from space_dist.curricula.spdrl import SelfPaced
 
@@ -49,9 +57,14 @@ class Makers:
     train: the instance set, and `source` the file it came from.
     draws: how many a round can use.
     bounds: of the contexts of the environment.
+    recorded: what another run was trained on, for who follows it.
     """
 
-    def __init__(self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds) -> None:
+    def __init__(
+        self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds,
+        recorded: bytes | None = None,
+    ) -> None:  # fmt: skip
+        self._recorded = recorded
         self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
 
     def make(self, settings: CurriculumConfig) -> Curriculum:
@@ -70,6 +83,10 @@ class Makers:
             LevelReplayConfig: self._level_replay,
             LearnabilityConfig: self._learnability,
             ProximalConfig: self._proximal,
+            LearningProgressConfig: self._learning_progress,
+            TransportConfig: self._transport,
+            ReplayConfig: self._replay,
+            WatchedConfig: self._watched,
             CustomConfig: self._custom,
         }
         return makers[type(settings)](settings)
@@ -147,7 +164,8 @@ class Makers:
     def _level_replay(self, settings: LevelReplayConfig) -> LevelReplay:
         return LevelReplay(
             self._train, seed=self._seed, draws=self._draws, temperature=settings.temperature,
-            staleness_share=settings.staleness_share, within_update=settings.within_update,
+            staleness_share=settings.staleness_share, within_update=settings.within_update, score=settings.score,
+            robust=Robust(settings.replay_share, settings.scored_share) if settings.robust else None,
         )  # fmt: skip
 
     def _learnability(self, settings: LearnabilityConfig) -> Learnability:
@@ -166,6 +184,45 @@ class Makers:
             scale=settings.scale, largest=settings.largest_return,
         )  # fmt: skip
 
+    def _learning_progress(self, settings: LearningProgressConfig) -> LearningProgress:
+        return LearningProgress(
+            self._train, seed=self._seed, draws=self._draws, outcome=settings.outcome, lowest=settings.lowest_return,
+            largest=settings.largest_return, smoothing=settings.smoothing, theta=settings.theta,
+            uniform_share=settings.uniform_share,
+        )  # fmt: skip
+
+    def _transport(self, settings: TransportConfig) -> Transport:
+        from space_dist.curricula.currot import Transport
+
+        return Transport(
+            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, from_set=settings.over == "set",
+            target=None if settings.target == "set" else self._normal(settings), delta=settings.delta,
+            discounted=settings.performance == "discounted_return", epsilon=settings.epsilon,
+            particles=settings.particles,
+        )  # fmt: skip
+
+    def _watched(self, settings: WatchedConfig) -> Watched:
+        return Watched(
+            self._train, seed=self._seed, draws=self._draws, iterations=settings.iterations, shares=settings.shares,
+            advantages=settings.advantages,
+        )  # fmt: skip
+
+    def _replay(self, settings: ReplayConfig) -> Replay:
+        if self._recorded is None:
+            raise ConfigError("curriculum.kind: replay follows the curriculum of a run, which this is none of")
+        try:
+            recording = Recording.decode(self._recorded)
+        except ValueError as error:
+            raise ConfigError(f"curriculum.of: {settings.of} holds no recorded curriculum: {error}") from None
+        strangers = recording.strangers(self._train)
+        if len(strangers):
+            more = f" (and {len(strangers) - 1} more)" if len(strangers) > 1 else ""
+            raise ConfigError(
+                f"curriculum.of: {settings.of} was trained on instance {strangers[0]}{more}, which {self._source} does "
+                "not have, or with another context: who follows a run needs its instances"
+            )
+        return Replay(self._train, recording, draws=self._draws)
+
     def _self_paced(self, settings: SelfPacedConfig) -> SelfPaced:
         from space_dist.curricula.gaussian import Gaussian
         from space_dist.curricula.spdrl import SelfPaced
@@ -176,13 +233,7 @@ class Makers:
             self._features("initial_mean", settings.initial_mean, bounds, middle),
             self._features("initial_std", settings.initial_std, bounds, width / 4.0),
         )
-        if settings.target == "set_moments":
-            target = self._set_moments()
-        else:
-            target = Gaussian.of(
-                self._features("target_mean", settings.target_mean, bounds, middle),
-                self._features("target_std", settings.target_std, bounds, width),
-            )
+        target = self._set_moments() if settings.target == "set_moments" else self._normal(settings)
         least = settings.least_std
         return SelfPaced(
             seed=self._seed, draws=self._draws, bounds=bounds, initial=initial, target=target,
@@ -190,6 +241,15 @@ class Makers:
             optimiser=settings.optimiser, least_std_until=settings.least_std_until,
             least_std=None if least is None else self._features("least_std", least, bounds, width),
         )  # fmt: skip
+
+    def _normal(self, settings: SelfPacedConfig | TransportConfig) -> Gaussian:
+        from space_dist.curricula.gaussian import Gaussian
+
+        bounds = self._bounds
+        return Gaussian.of(
+            self._features("target_mean", settings.target_mean, bounds, (bounds.low + bounds.high) / 2.0),
+            self._features("target_std", settings.target_std, bounds, bounds.high - bounds.low),
+        )
 
     def _set_moments(self) -> Gaussian:
         from space_dist.curricula.gaussian import Gaussian

@@ -175,6 +175,8 @@ class Custom(Curriculum):
             )
         if wants.advantages and not wants.episodes:
             self._refuse("it wants advantages, which are told by episode, and no episodes: set Wants(episodes=True)")
+        if wants.success and not wants.episodes:
+            self._refuse("it wants success, which is told by episode, and no episodes: set Wants(episodes=True)")
         return wants
 
     # ---- what it answers ----
@@ -220,6 +222,8 @@ class Custom(Curriculum):
             self._refuse(f"{who} selects instance {ids[others][0]} with another context than its own")
         if generated.any():
             self._look_at_generated(contexts[generated], drawn=selection.drawn, who=who)
+        if not selection.learned and not self.wants.unlearned:
+            self._refuse(f"{who} selects what shall not be learned from; say so before: set Wants(unlearned=True)")
         if selection.drawn and len(ids) < self._draws.count:
             self._refuse(f"{who} draws {len(ids)} times; a round can use {self._draws.count} (draws.count)")
 

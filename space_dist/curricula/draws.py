@@ -72,11 +72,12 @@ class Drawn(Curriculum):
         random = generator(self._seed, Purpose.DRAWS, version)
         return random.choice(len(chances), size=self._draws.count, p=chances)
 
-    def _drawn(self, version: int, indices: IntArray) -> Selection:
+    def _drawn(self, version: int, indices: IntArray, *, learned: bool = True) -> Selection:
         dealt = self._draws.dealt(indices)
         return Selection(
-            version, self._instances.ids[dealt], self._instances.contexts[dealt], order_version=version, drawn=True
-        )
+            version, self._instances.ids[dealt], self._instances.contexts[dealt], order_version=version, drawn=True,
+            learned=learned,
+        )  # fmt: skip
 
     def _numbers(self, feedback: Feedback, chances: FloatArray) -> Numbers:
         """What all of these log: instances trained on, how many the next draws spread over, and mean values."""

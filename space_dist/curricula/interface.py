@@ -31,6 +31,8 @@ class Selection:
     order_version: the version at which ids last changed; while it stays, the walk goes on where it stopped.
     drawn: whether these are draws, at least one for each episode that a round can hold, instead of a set to be passed
         over: an iteration is one round then, and what counts as trained on are the draws whose episodes ended.
+    learned: whether the learner learns from these rounds. Where not, they are played for what they show, and charged to
+        the budget all the same; `Wants.unlearned`.
     """
 
     version: int
@@ -38,6 +40,7 @@ class Selection:
     contexts: FloatArray
     order_version: int
     drawn: bool = False
+    learned: bool = True
 
 
 @dataclass(frozen=True)
@@ -108,12 +111,16 @@ class Wants:
     advantages: `Episodes.advantages`, which only learners with advantages have.
     ensemble: an ensemble of value functions, trained on the rollouts, and its `Feedback.ensemble`.
     probes: to be asked, by `Curriculum.probes`, which instances shall be probed; the environment must report success.
+    success: `Episodes.success`, which only some environments report.
+    unlearned: to have rounds played that the learner does not learn from (`Selection.learned`); on-policy learners.
     """
 
     episodes: bool = False
     advantages: bool = False
     ensemble: bool = False
     probes: bool = False
+    success: bool = False
+    unlearned: bool = False
 
 
 @dataclass(frozen=True)

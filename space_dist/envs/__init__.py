@@ -18,6 +18,7 @@ from space_dist.envs.antgoal import BatchedAntGoal
 from space_dist.envs.ballcatching import BatchedBallCatching
 from space_dist.envs.carl import CarlEnv, is_carl
 from space_dist.envs.cartpole import BatchedCartPole
+from space_dist.envs.goalmaze import BatchedGoalMaze
 from space_dist.envs.interface import (
     BatchedEnv,
     ContextVisible,
@@ -29,6 +30,7 @@ from space_dist.envs.interface import (
     close,
 )
 from space_dist.envs.maze import BatchedMaze
+from space_dist.envs.mixed_maze import BatchedMixedMaze
 from space_dist.envs.observations import Observations
 from space_dist.envs.pointmass import BatchedPointMass
 from space_dist.envs.single import ContextObservation, SingleEnv
@@ -41,10 +43,12 @@ from space_dist.system.importing import load
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
     "space_dist/PointMass-v0": BatchedPointMass,
     "space_dist/SparsePointMass-v0": BatchedSparsePointMass,
+    "space_dist/GoalMaze-v0": BatchedGoalMaze,
     "space_dist/CartPole-v0": BatchedCartPole,
     "space_dist/AntGoal-v0": BatchedAntGoal,
     "space_dist/BallCatching-v0": BatchedBallCatching,
     "space_dist/Maze-v0": BatchedMaze,
+    "space_dist/MixedMaze-v0": BatchedMixedMaze,
 }
 BULLET_IDS = frozenset({"space_dist/AntGoal-v0", "space_dist/BallCatching-v0"})
 """Those whose physics are PyBullet's."""
@@ -235,7 +239,9 @@ __all__ = [
     "BatchedBallCatching",
     "BatchedCartPole",
     "BatchedEnv",
+    "BatchedGoalMaze",
     "BatchedMaze",
+    "BatchedMixedMaze",
     "BatchedPointMass",
     "BatchedSingles",
     "BatchedSparsePointMass",

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from space_dist.envs import antgoal, ballcatching, cartpole, maze, pointmass, sparse_pointmass
+from space_dist.envs import antgoal, ballcatching, cartpole, goalmaze, maze, mixed_maze, pointmass, sparse_pointmass
 from space_dist.envs.interface import Distribution
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import MAX_INSTANCES, InstanceSet, repeats, shown
@@ -16,7 +16,7 @@ from space_dist.seeding import Purpose, generator
 MAX_REDRAWS: Final = 100
 DISTRIBUTIONS: Final[Mapping[str, Distribution]] = {
     name: distribution
-    for env in (pointmass, sparse_pointmass, cartpole, antgoal, ballcatching, maze)
+    for env in (pointmass, sparse_pointmass, goalmaze, cartpole, antgoal, ballcatching, maze, mixed_maze)
     for name, distribution in env.DISTRIBUTIONS.items()
 }
 

@@ -135,6 +135,17 @@ class DrawsContexts(Protocol):
 
 
 @runtime_checkable
+class DrawsUnsolvable(Protocol):
+    """An environment, batched or single, that knows of contexts in which no policy succeeds."""
+
+    def draw_unsolvable(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """`(n, d)` such contexts, within the bounds, independent rows.
+
+        Raises ConfigError if, made with these arguments, it has none.
+        """
+
+
+@runtime_checkable
 class KnowsOptimum(Protocol):
     """A batched environment that knows what a perfect policy would earn."""
 

@@ -5,24 +5,24 @@ Facts: docs/environments.md ("Maze").
 
 from __future__ import annotations
 
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.interface import Distribution, FloatArray, IntArray, Step
-from space_dist.envs.layouts import CELLS, GOAL, SIDE, START, carve, shortest_ways, successors, symmetrised
+from space_dist.envs.layouts import SIDE, START, Cells, carve, shortest_ways, successors, symmetrised, walled_off
 from space_dist.instances import ContextBounds
 
 GOAL_REWARD = 1.0
-STEP_REWARD = -0.1 / CELLS  # of every step but the one onto the goal
+WAY_REWARD = -0.1  # of every step but the one onto the goal, divided by the number of cells
 HORIZON = 200  # gym-maze registers 2,000: ours is shorter
 
 BOUNDS: Final = ContextBounds(
     names=tuple(f"cell_{x}_{y}" for y in range(SIDE) for x in range(SIDE)),
-    low=np.zeros(CELLS),
-    high=np.full(CELLS, 15.0),
+    low=np.zeros(SIDE * SIDE),
+    high=np.full(SIDE * SIDE, 15.0),
 )
 """Maze: the bits of each cell's open sides (north 1, east 2, south 4, west 8), in reading order; `cell_x_y`."""
 
@@ -53,21 +53,26 @@ class BatchedMaze:
     random: seeds are accepted and decide nothing.
     """
 
+    bounds: ClassVar[ContextBounds] = BOUNDS
+    side: ClassVar[int] = SIDE  # of the square that cells are numbered in
+
     def __init__(self, n_slots: int, *, horizon: int = HORIZON) -> None:
         self.n_slots, self.horizon = n_slots, horizon
-        self.observation_space = spaces.Box(0, SIDE - 1, shape=(2,), dtype=np.int64)
+        self.observation_space = spaces.Box(0, self.side - 1, shape=(2,), dtype=np.int64)
         self.action_space = spaces.Discrete(4)
-        self.context_bounds = BOUNDS
-        self._next = np.zeros((n_slots, CELLS, 4), dtype=np.int64)
+        self.context_bounds = self.bounds
+        self._next = np.zeros((n_slots, self.side**2, 4), dtype=np.int64)
         self._slots = np.arange(n_slots)
         self._cell = np.full(n_slots, START)
+        self._goal = np.full(n_slots, START)
+        self._step_reward = np.zeros(n_slots)
         self._time = np.zeros(n_slots, dtype=np.int64)
 
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> NDArray[np.int64]:  # noqa: ARG002
-        """Start new episodes at (0, 0). Raises ValueError for a layout of anything but whole numbers."""
-        if (contexts != np.floor(contexts)).any():
-            raise ValueError("a maze's layout is 25 whole numbers from 0 to 15")
-        self._next[slots] = successors(contexts)
+        """Start new episodes at (0, 0). Raises ValueError for contexts that are no layout, such as half a wall."""
+        layouts, sides = self._read(contexts)
+        self._next[slots] = successors(layouts)
+        self._goal[slots], self._step_reward[slots] = self._goals(sides), WAY_REWARD / sides**2
         self._cell[slots], self._time[slots] = START, 0
         return self._observe(self._cell[slots])
 
@@ -78,31 +83,47 @@ class BatchedMaze:
             raise ValueError(f"actions must be 0, 1, 2 or 3, not {np.array2string(actions, threshold=10)}")
         self._cell = self._next[self._slots, self._cell, moves]
         self._time += 1
-        arrived = self._cell == GOAL
+        arrived = self._cell == self._goal
         return Step(
             observations=self._observe(self._cell),
-            rewards=np.where(arrived, GOAL_REWARD, STEP_REWARD),
+            rewards=np.where(arrived, GOAL_REWARD, self._step_reward),
             terminated=arrived,
             truncated=(self._time >= self.horizon) & ~arrived,
             success=arrived.copy(),
         )
 
     def draw_contexts(self, rng: np.random.Generator, n: int) -> FloatArray:
-        """`(n, 25)` perfect mazes: few layouts within the bounds are mazes with a way through."""
+        """`(n, d)` perfect mazes: few layouts within the bounds are mazes with a way through."""
         return carve(rng, n)
 
+    def draw_unsolvable(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """`(n, d)` perfect mazes with one passage of the way to the goal closed."""
+        return walled_off(rng, carve(rng, n))
+
     def optimal_returns(self, contexts: FloatArray) -> FloatArray:
-        """`(n, 25) -> (n,)` undiscounted returns of the shortest ways: 1 - 0.004 (L - 1) for L moves.
+        """`(n, d) -> (n,)` undiscounted returns of the shortest ways: 1 - 0.004 (L - 1) for L moves in a 5x5 maze.
 
         Where no way is short enough for the horizon, standing still is as good as anything.
         """
-        moves = shortest_ways(contexts)
+        layouts, sides = self._read(contexts)
+        moves, step_reward = shortest_ways(layouts, self._goals(sides)), WAY_REWARD / sides**2
         inside = moves <= self.horizon
         best: FloatArray = np.where(
-            inside, GOAL_REWARD + STEP_REWARD * (np.where(inside, moves, 1) - 1), STEP_REWARD * self.horizon
+            inside, GOAL_REWARD + step_reward * (np.where(inside, moves, 1) - 1), step_reward * self.horizon
         )
         return best
 
-    @staticmethod
-    def _observe(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.stack([cells % SIDE, cells // SIDE], axis=1)
+    def _read(self, contexts: FloatArray) -> tuple[FloatArray, Cells]:
+        """`(n, d) -> (n, cells), (n,)` layouts and the side of each maze, whose goal is its lower right cell.
+
+        Raises ValueError for a layout of anything but whole numbers.
+        """
+        if (contexts != np.floor(contexts)).any():
+            raise ValueError("a maze's layout is 25 whole numbers from 0 to 15")
+        return contexts, np.full(len(contexts), self.side)
+
+    def _goals(self, sides: Cells) -> Cells:
+        return (sides - 1) * (self.side + 1)
+
+    def _observe(self, cells: Cells) -> Cells:
+        return np.stack([cells % self.side, cells // self.side], axis=1)

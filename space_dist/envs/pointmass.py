@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.interface import Distribution, FloatArray, IntArray, Step
+from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
 
 DT = 0.01  # seconds per inner step
@@ -34,6 +35,7 @@ BOUNDS: Final = ContextBounds(
     high=np.array([4.0, 8.0, 4.0]),
 )
 """PointMass (Klink et al. 2020): centre and width of the gate in the world's length units, friction in 1/s."""
+BOUNDS_WITH_CLOSED_GATES: Final = ContextBounds(BOUNDS.names, np.array([-4.0, 0.0, 0.0]), BOUNDS.high)
 
 
 def _draw_uniform(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
@@ -85,14 +87,18 @@ class BatchedPointMass:
 
     State per slot: (x, vx, y, vy) in float64; observed as float32. An episode's noise is drawn from its seed, all
     (horizon, inner steps, 2) numbers at once, so that it depends on nothing but the seed.
+
+    With `closed_gates` gates may be as narrow as 0, which nothing gets through.
     """
 
-    def __init__(self, n_slots: int, *, horizon: int = HORIZON) -> None:
+    def __init__(self, n_slots: int, *, horizon: int = HORIZON, closed_gates: bool = False) -> None:
+        if not isinstance(closed_gates, bool):
+            raise ConfigError(f"closed_gates is {str(closed_gates)[:80]!r}; allowed are true and false")
         self.n_slots, self.horizon = n_slots, horizon
         limit = np.array([POSITION_LIMIT, np.inf, POSITION_LIMIT, np.inf], dtype=np.float32)
         self.observation_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, shape=(2,), dtype=np.float32)
-        self.context_bounds = BOUNDS
+        self.context_bounds = BOUNDS_WITH_CLOSED_GATES if closed_gates else BOUNDS
         self._position = np.zeros((2, n_slots))  # x and y
         self._velocity = np.zeros((2, n_slots))
         self._context = np.zeros((3, n_slots))
@@ -136,6 +142,17 @@ class BatchedPointMass:
         physics = Physics(DT, FORCE, NOISE_STD, ACTION_LIMIT, POSITION_LIMIT)
         self._compiled = functools.partial(prepare(), physics)
 
+    def draw_unsolvable(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """`(n, 3)` contexts whose gate is closed, in all else uniform within the bounds.
+
+        Raises ConfigError unless gates may be closed: any other lets somebody through.
+        """
+        if self.context_bounds != BOUNDS_WITH_CLOSED_GATES:
+            raise ConfigError("only with closed_gates: true is any instance unsolvable: gates of width 0")
+        drawn = _draw_uniform(rng, n)
+        drawn[:, 1] = 0.0
+        return drawn
+
     def _advance(self, actions: FloatArray) -> NDArray[np.bool_]:
         """Ten inner steps under (n_slots, 2) actions. Returns which slots hit the wall."""
         if self._compiled is not None:
@@ -175,7 +192,8 @@ class BatchedPointMass:
             for inner in np.flatnonzero(crossed[:, slot]):
                 (x0, y0), (x1, y1) = path[inner, :, slot], path[inner + 1, :, slot]
                 wall_x = x0 + y0 / (y0 - y1) * (x1 - x0)
-                if abs(wall_x - gate_x[slot]) > gate_width[slot] / 2:
+                half_width = gate_width[slot] / 2
+                if abs(wall_x - gate_x[slot]) > half_width or half_width == 0.0:
                     crashed[slot] = True
                     self._position[:, slot] = wall_x, 0.0
                     self._velocity[:, slot] = 0.0

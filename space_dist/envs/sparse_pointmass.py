@@ -45,8 +45,8 @@ class BatchedSparsePointMass(BatchedPointMass):
     an episode's return is 1 if it succeeds, else 0.
     """
 
-    def __init__(self, n_slots: int, *, horizon: int = HORIZON) -> None:
-        super().__init__(n_slots, horizon=horizon)
+    def __init__(self, n_slots: int, *, horizon: int = HORIZON, closed_gates: bool = False) -> None:
+        super().__init__(n_slots, horizon=horizon, closed_gates=closed_gates)
         self.action_space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
 
     def step(self, actions: NDArray[np.generic]) -> Step:

@@ -218,7 +218,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
             for key, value in (*grid.set.items(), *point.items()):
                 if key == "extends":
                     continue
-                here = _from_folder(value, folder) if key.partition(".")[0] in ("instances", "init_from") else value
+                here = configs.from_folder(key, value, folder)
                 configs.put(data, key, json.loads(json.dumps(here)), key)
             cells.append((point, data))
     except ConfigError as error:
@@ -233,12 +233,6 @@ def _refuse_search(data: Mapping[str, Any], path: Path) -> None:
         raise ConfigError(f"{path} is a search: space-dist tune run {path}. A grid has no `arms`")
 
 
-def _from_folder(value: Any, folder: Path) -> Any:
-    if isinstance(value, dict):
-        return configs.from_folder(value, folder)
-    return configs.beside(value, folder)
-
-
 def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:
     """What a cell is called in tables: `kappa=4 eta=0.05`."""
     ends = [key.rpartition(".")[2] for key in axes]
@@ -247,12 +241,21 @@ def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:
         value = point[key]
         if key == "extends":
             parts.append(Path(value).stem)
+        elif key == "schedule":
+            parts.append(_changes(value))
         elif isinstance(value, dict):
             rest = [f"{name}={_word(item)}" for name, item in value.items() if name != "kind"]
             parts.append(" ".join([_word(value["kind"]) if "kind" in value else end, *rest]))
         else:
             parts.append(f"{end if ends.count(end) == 1 else key}={_word(value)}")
     return " ".join(parts)[:_MAX_LABEL] or "all"
+
+
+def _changes(schedule: Any) -> str:
+    """A schedule in words: `from 50000 round_robin`."""
+    if not schedule or not all(isinstance(one, dict) and isinstance(one.get("set"), dict) for one in schedule):
+        return "unchanged" if not schedule else f"schedule={_word(schedule)}"
+    return ", ".join(f"from {one.get('steps')} {label_of(one['set'], list(one['set']))}" for one in schedule)
 
 
 def _word(value: Any) -> str:

@@ -467,10 +467,8 @@ def base_of(config: TuneConfig, arm: str, folder: Path) -> dict[str, Any]:
 
 def put(data: dict[str, Any], key: str, value: Any, folder: Path) -> None:
     """Set a key in a run config's plain data; the relative paths of a file are taken from its folder."""
-    if key.partition(".")[0] in ("instances", "init_from"):
-        value = configs.from_folder(value, folder) if isinstance(value, dict) else configs.beside(value, folder)
     # A copy: trials that shared a list or a section would write into each other's.
-    configs.put(data, key, json.loads(json.dumps(value)), key)
+    configs.put(data, key, json.loads(json.dumps(configs.from_folder(key, value, folder))), key)
 
 
 def find_tune(path: Path, root: Path) -> Grid:

@@ -47,7 +47,7 @@ def take_over(grid: Grid, parent: Cell, heir: Cell, seeds: tuple[int, ...]) -> i
 def _copy(source: Ledger, folder: Path) -> None:
     """What decides how a run goes on; not who worked on it, nor what was said of that."""
     folder.chmod(source.folder.stat().st_mode & 0o777)  # a temporary folder is its owner's alone
-    one_by_one = [source.status_file, source.config, source.initial_weights]
+    one_by_one = [source.status_file, source.config, *source.given.values()]
     one_by_one += [source.instances("train"), source.instances("test"), *(source.folder / name for name in ROW_FILES)]
     for path in one_by_one:
         if path.exists():

@@ -407,8 +407,8 @@ def _client(address: str) -> JobSubmissionClient:
         return JobSubmissionClient(address)
     except AuthenticationError as error:
         raise SpaceDistError(
-            f"Ray's job server at {address} lets nobody in without its cluster's token: set RAY_AUTH_MODE=token, and have "
-            f"that token in ~/.ray/auth_token ({_first(error)})"
+            f"Ray's job server at {address} lets nobody in without its cluster's token: set RAY_AUTH_MODE=token, and "
+            f"have that token in ~/.ray/auth_token ({_first(error)})"
         ) from error
     except (ConnectionError, RuntimeError, ValueError, requests.RequestException) as error:
         raise SpaceDistError(f"Ray's job server at {address} does not answer: {_first(error)}") from error

@@ -27,7 +27,6 @@ from space_dist.experiment.manifest import (
 from space_dist.grid.conductor import freeze
 from space_dist.instances import InstanceSet
 from space_dist.run.building import Blueprint
-from space_dist.run.starting import weights_in
 from space_dist.system.provenance import code_digest, git_state, source_digest
 from space_dist.tracking.settling import settled
 
@@ -93,10 +92,10 @@ class InstanceFiles:
             self._read[key] = blueprint.instances()
         return self._read[key]
 
-    def kept(self, weights: bytes) -> str:
-        """The name under which what a cell starts from (`init_from`) lies beside them."""
-        name = f"{hashlib.sha256(weights).hexdigest()[:16]}.npz"
-        self.contents[name] = weights
+    def kept(self, given: bytes) -> str:
+        """The name under which what other runs give a cell (`init_from`, ...) lies beside them."""
+        name = f"{hashlib.sha256(given).hexdigest()[:16]}.npz"
+        self.contents[name] = given
         return name
 
     def name(self, instances: InstanceSet) -> str:
@@ -138,15 +137,15 @@ def frozen_cell(
         # For its errors: a grid of which one cell cannot work is not frozen.
         blueprint.setup(train, test)
         sources = {path: source_digest(path) for path in config.import_paths}
-    weights = None if config.init_from is None else weights_in(config.init_from)
     identity = configs.identity(
-        config, train.digest(), test.digest(), weights=weights, sources=sources, with_seed=False
+        config, train.digest(), test.digest(), given=blueprint.given, sources=sources, with_seed=False
     )  # fmt: skip
+    config = config.with_given(
+        {key: Path("instances", files.kept(content)) for key, content in blueprint.given.items()}
+    )
     data = config.model_dump(mode="json", exclude={"seed", "tracking", "resources"})
     data["instances"] = {split: f"instances/{files.name(chosen)}" for split, chosen in
                              (("train", train), ("test", test))}  # fmt: skip
-    if weights is not None:
-        data["init_from"] = f"instances/{files.kept(weights)}"
     cell = Cell(identity[:CELL_ID_DIGITS], label, point, data, blueprint.stack, blueprint.memory)
     return cell, blueprint.total_steps
 

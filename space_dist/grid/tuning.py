@@ -40,7 +40,7 @@ from space_dist.grid.planning import InstanceFiles, frozen_cell, resolved_cell
 from space_dist.grid.trials import asked, with_settings
 from space_dist.instances import InstanceSet, refuse_overlap, repeats
 from space_dist.run.building import Blueprint
-from space_dist.run.training import next_evaluation
+from space_dist.run.rows import next_evaluation
 from space_dist.system.files import atomic_write, in_words
 from space_dist.system.provenance import code_digest, git_state
 from space_dist.tracking.settling import settled
@@ -185,8 +185,7 @@ class _Planned:
             resolved_cell(self.config.name, name, confirmed, "confirm.set")
         self.steps += steps * len(self.config.seed_list()) * self.config.trials
         base = {**data, "instances": dict(cell.config["instances"])}
-        if "init_from" in cell.config and cell.config["init_from"] is not None:
-            base["init_from"] = cell.config["init_from"]
+        _with_given(base, cell.config, "")
         return ArmRecord(base, {key: one.model_dump(mode="json") for key, one in space.items()})
 
     @staticmethod
@@ -271,6 +270,14 @@ class _Planned:
         return {"train": f"instances/{self._files.name(final_train)}", "test": f"instances/{self._files.name(final)}"}
 
 
+def _with_given(data: dict[str, Any], frozen: Mapping[str, Any], prefix: str) -> None:
+    """Name in `data` what other runs have given where it lies in a grid's folder, as `frozen` does, behind `prefix`."""
+    if frozen.get("init_from") is not None:
+        data["init_from"] = f"{prefix}{frozen['init_from']}"
+    if "of" in data.get("curriculum", {}):
+        data["curriculum"] = {**data["curriculum"], "of": f"{prefix}{frozen['curriculum']['of']}"}
+
+
 def _refuse_seen(development: InstanceSet, final: InstanceSet, what: str) -> None:
     """Raise ConfigError if a context of the final set is one that the search was judged by."""
     if development.names != final.names:
@@ -315,8 +322,7 @@ def confirmation(grid: Grid, manifest: Manifest) -> Path:
             data["schedule"] = schedule
         for split, path in search.final.items():
             configs.put(data, f"instances.{split}", f"../{path}", "confirm")
-        if data.get("init_from") is not None:
-            data["init_from"] = f"../{data['init_from']}"
+        _with_given(data, record.base, "../")
         data["name"] = f"{manifest.name}_{arm}"[:100]
         files[f"{arm}.yaml"] = f"# Arm {arm} of the search {manifest.name}: trial {best.number}.\n".encode()
         files[f"{arm}.yaml"] += configs.to_yaml(data).encode()

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from space_dist.kernels.build import ready
-from space_dist.kernels.lanes import compiled, entry
+from space_dist.kernels.lanes import entry
+from space_dist.kernels.scalars import clipped
 
 
 class Physics(NamedTuple):
@@ -23,16 +24,6 @@ class Physics(NamedTuple):
     noise: float
     action_limit: float
     position_limit: float
-
-
-@compiled
-def _clipped(value: Any, limit: Any) -> Any:
-    """`value` within +-limit; what is not a number stays so, as with NumPy's minimum and maximum."""
-    if value > limit:
-        return limit
-    if value < -limit:
-        return -limit
-    return value
 
 
 @entry
@@ -48,17 +39,17 @@ def advance(
     for slot in range(position.shape[1]):
         time = min(times[slot], noise.shape[1] - 1)
         gate_x, half_width, decay = context[0, slot], context[1, slot] / 2, 1.0 - step * context[2, slot]
-        force_x = physics.force * _clipped(actions[slot, 0], most)
-        force_y = physics.force * _clipped(actions[slot, 1], most)
+        force_x = physics.force * clipped(actions[slot, 0], most)
+        force_y = physics.force * clipped(actions[slot, 1], most)
         x, y, vx, vy = position[0, slot], position[1, slot], velocity[0, slot], velocity[1, slot]
         hit, wall_x = False, 0.0
         for inner in range(noise.shape[2]):
             x_before, y_before = x, y
-            x = _clipped(vx * step + x_before, limit)
-            y = _clipped(vy * step + y_before, limit)
+            x = clipped(vx * step + x_before, limit)
+            y = clipped(vy * step + y_before, limit)
             if not hit and y_before * y <= 0.0 and y_before != y:
                 wall_x = x_before + y_before / (y_before - y) * (x - x_before)
-                hit = abs(wall_x - gate_x) > half_width
+                hit = abs(wall_x - gate_x) > half_width or half_width == 0.0
             vx = vx * decay + (noise[slot, time, inner, 0] * physics.noise + force_x) * step
             vy = vy * decay + (noise[slot, time, inner, 1] * physics.noise + force_y) * step
         if hit:

@@ -78,6 +78,15 @@ class CoupledLearner:
             learn_together(self.learners, self.parts(shards), round=[round] * count, steps=[steps] * count)
         )
 
+    def look_at(
+        self, shards: Sequence[Shard], *, round: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
+        """See `Learner`."""
+        if acted is not None:
+            raise RuntimeError("a population looks at rounds of its present weights only")
+        each = zip(self.learners, self.parts(shards), strict=True)
+        return self.combined([learner.look_at(mine, round=round) for learner, mine in each])
+
     def save(self) -> tuple[Arrays, dict[str, Any]]:
         """See `Learner`."""
         saved = [learner.save() for learner in self.learners]

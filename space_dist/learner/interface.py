@@ -87,6 +87,14 @@ class Learner(Protocol):
         Raises SpaceDistError if the networks are no longer numbers.
         """
 
+    def look_at(
+        self, shards: Sequence[Shard], *, round: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
+        """What an update on these shards would say of their advantages, without one; otherwise as `update`.
+
+        The shards enter the statistics. Raises RuntimeError for learners without advantages.
+        """
+
     def parts(self, shards: Sequence[Shard]) -> list[list[Shard]]:
         """The shards of each of `learners`, counted from 0."""
 
@@ -242,6 +250,21 @@ class SB3Learner(abc.ABC):
             if not torch.isfinite(numbers).all():
                 raise ValueError(NOT_A_NUMBER)
         return self._learnt(shards, before)
+
+    def look_at(
+        self, shards: Sequence[Shard], *, round: int, acted: Mapping[str, NDArray[Any]] | None = None
+    ) -> Update:  # fmt: skip
+        """See `Learner`."""
+        require_order(shards)
+        self._acted = acted
+        with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
+            sizes = self._sizes(shards)
+        self.observe(shards)
+        return Update({}, 0, sizes)
+
+    def _sizes(self, shards: Sequence[Shard]) -> NDArray[np.float64]:  # noqa: ARG002 - on-policy learners need them
+        """|GAE| of each transition, as `Update.advantages`."""
+        raise RuntimeError(f"{type(self.model).__name__} computes no advantages")
 
     def _learnt(self, shards: Sequence[Shard], before: int) -> Update:
         """What an update reports, of the gradient steps since there were `before`; the statistics take in the shards.

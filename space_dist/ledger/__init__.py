@@ -1,7 +1,8 @@
 """A run's own folder: the truth about it.
 
     config.yaml           what was asked for, resolved; with instances_train.csv and instances_test.csv beside it, and
-                          init.npz, the networks it started from, where the config has an init_from
+                          with what other runs gave it: init.npz, the networks it started from (`init_from`), and
+                          recorded.npz, the curriculum it follows (`curriculum.of`)
     status.json           where the run stands (atomic); names the last checkpoint, how much of each file it covers, and
                           the hashes of the files that are written whole
     metrics.jsonl         one row per iteration and per evaluation; a pure function of config and seed
@@ -38,7 +39,7 @@ from space_dist.ledger.checkpoint import (
     encode_arrays,
     encode_checkpoint,
 )
-from space_dist.ledger.folder import Ledger, State, Status, find_ledgers
+from space_dist.ledger.folder import GIVEN, Ledger, State, Status, find_ledgers
 from space_dist.ledger.lock import LEASE_SECONDS, Lock, believed_alive, owner_alive, process_of, this_process
 from space_dist.ledger.rows import (
     CURRICULUM,
@@ -58,6 +59,7 @@ from space_dist.ledger.writer import RunWriter
 __all__ = [
     "CURRICULUM",
     "FORMAT",
+    "GIVEN",
     "LEASE_SECONDS",
     "METRICS",
     "MOST_VALUED",

@@ -11,7 +11,7 @@ import re
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from space_dist.errors import LedgerError
 from space_dist.ledger.checkpoint import FORMAT, READABLE, Checkpoint, decode_checkpoint
@@ -61,6 +61,9 @@ class Status:
         return self.state == "done" and bool(evaluated_at == self.steps)
 
 
+GIVEN: Final = {"init_from": "init.npz", "curriculum.of": "recorded.npz"}
+
+
 class Ledger:
     """The one class that knows the paths of a run. Reading needs no lock; writing is `RunWriter`'s."""
 
@@ -73,7 +76,8 @@ class Ledger:
         self.log = self.folder / "log.txt"
         self.stop_file = self.folder / "stop"
         self.lock_file = self.folder / "lock.json"
-        self.initial_weights = self.folder / "init.npz"
+        # What was taken from other runs, by the key that names it.
+        self.given = {key: self.folder / name for key, name in GIVEN.items()}
         self.model_arrays = self.folder / "model.npz"
         self.model_description = self.folder / "model.json"
 

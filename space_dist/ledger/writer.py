@@ -13,6 +13,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 from numpy.typing import NDArray
@@ -78,15 +79,18 @@ class RunWriter:
             raise RuntimeError("the run has no status yet")
         return self.status
 
-    def write_config(self, config: str, train: str, test: str, weights: bytes | None = None) -> None:
+    def write_config(
+        self, config: str, train: str, test: str, given: Mapping[str, bytes] = MappingProxyType({})
+    ) -> None:
         """Record what was asked for. The config comes last: a folder that has one is complete.
 
+        given: what was taken from other runs, by the key that names it.
         Where there is a status, it names both the old and the new content until the next one is written.
         """
         asked = {
             self.ledger.instances("train"): train.encode(),
             self.ledger.instances("test"): test.encode(),
-            **({} if weights is None else {self.ledger.initial_weights: weights}),
+            **{self.ledger.given[key]: content for key, content in given.items()},
             self.ledger.config: config.encode(),
         }
         with _clear_errors(self.ledger.folder), self._lock.held():

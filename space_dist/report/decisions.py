@@ -36,6 +36,11 @@ def explain(
             f"{ledger.folder}: curriculum.kind: {settings.kind} {what}, so it has no lines 6 to 12; "
             "explained are space, random_growth, cspace, manual, round_robin and fixed"
         )
+    if len(config.curricula) > 1 or config.fork is not None:
+        raise ConfigError(
+            f"{ledger.folder}: its {'seed' if config.fork else 'curriculum'} changes on the way "
+            f"({'fork' if config.fork else 'schedule'}), so its decisions cannot be made again from its start"
+        )
     decided = [row for row in ledger.rows(METRICS) if row["kind"] == "iteration" and row["complete"]]
     if not 1 <= iteration <= len(decided):
         raise ConfigError(

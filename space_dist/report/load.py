@@ -330,8 +330,8 @@ def _identity(run: Run) -> str:
     digests = [hashlib.sha256(_read_instances(run.ledger, split).encode()).hexdigest() for split in ("train", "test")]
     try:
         config = configs.parse(run.config, str(run.ledger.config))
-        weights = None if config.init_from is None else run.ledger.read(run.ledger.initial_weights)
-        return configs.identity(config, *digests, weights=weights, with_seed=False)
+        given = {key: run.ledger.read(run.ledger.given[key]) for key in config.given_paths}
+        return configs.identity(config, *digests, given=given, with_seed=False)
     except ConfigError:  # of another version's schema: its words are compared as they stand
         data = {key: value for key, value in run.config.items() if key not in {"seed", *configs.NOT_IDENTITY}}
         data["instances"] = digests

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -38,6 +39,7 @@ class Setup:
     test: InstanceSet
     episodes_per_round: int | None = None  # a round ends with this many episodes instead of with its slots' length
     keep_next_observations: bool = False
+    given: Mapping[str, bytes] = field(default_factory=dict)  # by other runs: `RunConfig.given_paths`
     policies: int = 1  # policies; each has an equal share of the shards, and of the parts of an evaluation
 
     def instances(self, split: Split) -> InstanceSet:

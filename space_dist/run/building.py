@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +15,10 @@ from space_dist import arithmetic
 from space_dist.config import RunConfig, learners_that
 from space_dist.curricula import Curriculum
 from space_dist.curricula.making import make_curriculum
+from space_dist.curricula.replay import Replay
 from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError, about, nearest
-from space_dist.instances import InstanceSet, read_csv, refuse_overlap
+from space_dist.instances import InstanceSet, read_csv, refuse_overlap, refuse_padding
 from space_dist.learner import (
     CoupledLearner,
     Ensemble,
@@ -31,7 +34,8 @@ from space_dist.learner import (
 from space_dist.ledger import Checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import MlpPolicy, Policy, Several, to_arrays
-from space_dist.run.starting import start_from, weights_in
+from space_dist.run.given import given_to
+from space_dist.run.starting import start_from
 from space_dist.seeding import member_seeds
 from space_dist.system.workplace import cores
 
@@ -73,17 +77,30 @@ class Blueprint:
             engine = "single"
         return config.model_copy(update={"engine": engine})
 
+    @functools.cached_property
+    def given(self) -> Mapping[str, bytes]:
+        """What other runs give it, by the key that names it: read once. Raises ConfigError where it cannot be used."""
+        return given_to(self.config)
+
+    def under(self, config: RunConfig) -> Blueprint:
+        """The same run under settings that are in force for a while: what other runs gave it is not read again."""
+        found = dataclasses.replace(self, config=config)
+        vars(found)["given"] = self.given
+        return found
+
     def instances(self) -> tuple[InstanceSet, InstanceSet]:
         """The training and test instances, from their files.
 
-        Raises ConfigError for a bad file, a context outside the environment's bounds, or one that both share.
+        Raises ConfigError for a bad file, a context outside the environment's bounds, or one that both share; and for
+        a test set with padding, in which no policy would succeed.
         """
-        files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.curriculum.columns_read
+        files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.columns_read
         with about("instances.train"):
             train = read_csv(files.train, bounds, columns)
         with about("instances.test"):
             test = read_csv(files.test, bounds, columns, if_there=True)
         refuse_overlap(train, test, str(files.train), str(files.test))
+        refuse_padding(test, f"instances.test: {files.test}")
         return train, test
 
     def setup(self, train: InstanceSet, test: InstanceSet) -> Setup:
@@ -103,6 +120,7 @@ class Blueprint:
             episodes_per_round=config.n_episodes,
             keep_next_observations=config.learner.keeps_next_observations,
             policies=config.n_policies,
+            given=self.given,
         )
         # Before the run's folder is touched: what cannot be leaves nothing behind.
         self._refuse_short_budget()
@@ -111,15 +129,17 @@ class Blueprint:
             refuse_population(config.learner, spec.observation_space, spec.action_space)
         self._refuse_equal_starts(train)
         # Asks the curriculum for what is not there? Better refused now than on an actor.
-        self._refuse_wants(self.curriculum(train))
+        curriculum = self.curriculum(train)
+        self._refuse_wants(curriculum)
+        self._refuse_recording(curriculum)
         self.ensemble()
         if config.init_from is not None:
-            start_from(self.learner(), weights_in(config.init_from))
+            start_from(self.learner(), self.given["init_from"])
         return setup
 
     def curriculum(self, train: InstanceSet) -> Curriculum:
         """The curriculum over `train`. Raises ConfigError if it asks for instances or features that are not there."""
-        return make_curriculum(self.config, train, self.spec.context_bounds)
+        return make_curriculum(self.config, train, self.spec.context_bounds, self.given)
 
     def learner(self) -> Learner:
         """The learner, or all of several policies, with initial networks."""
@@ -224,10 +244,34 @@ class Blueprint:
                 f"{config.learner.kind} does not compute. Allowed learners: "
                 f"{', '.join(learners_that('has_advantages'))}"
             )
-        if curriculum.wants.probes and not self.spec.knows_success(curriculum.start()[1].contexts[:1]):
+        if curriculum.wants.unlearned and not config.learner.has_advantages:
+            raise ConfigError(
+                f"curriculum.kind: {kind}, as it is set, plays rounds that are not learned from, and learner.kind: "
+                f"{config.learner.kind} learns from what it remembers. Allowed learners: "
+                f"{', '.join(learners_that('has_advantages'))}"
+            )
+        asks_success = curriculum.wants.probes or curriculum.wants.success
+        if asks_success and not self.spec.knows_success(curriculum.start()[1].contexts[:1]):
             raise ConfigError(
                 f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} "
                 "does not say (its steps have no `success`)"
+            )
+
+    def _refuse_recording(self, curriculum: Curriculum) -> None:
+        """Raise ConfigError for a recorded curriculum that iterations of this run cannot follow to their end."""
+        if not isinstance(curriculum, Replay):
+            return
+        config, recording = self.config, curriculum.recording
+        rounds = config.round_steps(self.spec.horizon)
+        if recording.round_steps != rounds:
+            raise ConfigError(
+                f"curriculum.of: a round of that run has {recording.round_steps} steps, and one of this run {rounds}: "
+                "iteration by iteration they would train at other times. Use its learner.n_steps"
+            )
+        if recording.budget_steps < config.budget.steps:
+            raise ConfigError(
+                f"budget.steps = {config.budget.steps} is more than the {recording.budget_steps} steps of the run that "
+                "curriculum.of names: there is nothing to follow behind its end"
             )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,6 +23,7 @@ from space_dist.rollout.walk import Walk
 from space_dist.system.workplace import cores
 
 _WORTH_RAY = 100_000  # environment steps: at some thousand a second, several times what it takes to start Ray
+_SILENT = "curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say"
 Handle = Any  # of a value that may still be computed elsewhere; only a Cluster looks inside
 
 
@@ -147,6 +149,9 @@ class CurriculumHost:
             version, before, after, gradient_steps, ensemble=ensemble,
             episodes=next(self._valued(seen, after), None), probes=self._probed(state, seen),
         )  # fmt: skip
+        episodes = feedback.episodes
+        if self.curriculum.wants.success and episodes is not None and np.isnan(episodes.success).any():
+            raise ConfigError(_SILENT)
         new, selection, numbers = self.curriculum.step(state, feedback)
         return new, selection, numbers, after
 
@@ -166,24 +171,27 @@ class CurriculumHost:
         outcomes = joined(parts)
         # `Blueprint` has asked one instance's first step only.
         if np.isnan(outcomes.success).any():
-            raise ConfigError("curriculum.kind: it needs to know whether an episode succeeded, and env.id does not say")
+            raise ConfigError(_SILENT)
         return Probes(indices, outcomes.returns, outcomes.lengths, outcomes.success)
 
 
 class Central(CurriculumHost):
     """The host of a run's curriculum."""
 
-    def __init__(self, config: RunConfig, train: InstanceSet, bounds: ContextBounds) -> None:
+    def __init__(
+        self, config: RunConfig, train: InstanceSet, bounds: ContextBounds,
+        given: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         from space_dist.curricula.making import make_curriculum
 
-        super().__init__(make_curriculum(config, train, bounds), config.curriculum)
+        super().__init__(make_curriculum(config, train, bounds, given), config.curriculum)
 
 
 class InProcess:
     """The cluster's twin without Ray: everything at once, here. Same bits."""
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._setup, self._central = setup, Central(config, setup.train, setup.spec.context_bounds)
+        self._setup, self._central = setup, Central(config, setup.train, setup.spec.context_bounds, setup.given)
         self._worker = Worker(setup)
 
     def put(self, value: object) -> Handle:

@@ -31,7 +31,7 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
 
 def takes_over(before: RunConfig, now: RunConfig, status: Status | None) -> bool:
     """Whether `now` is `before` with one more change, and the run is paused just where that comes into force."""
-    if status is None or status.state != "paused" or not now.schedule:
+    if status is None or status.state != "paused" or not now.schedule or now.schedule[-1].replaces_curriculum:
         return False
     return now.schedule[:-1] == before.schedule and status.paused_at == now.schedule[-1].steps
 

@@ -14,7 +14,7 @@ import sys
 import time
 import traceback
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
@@ -36,13 +36,12 @@ from space_dist.errors import (
     exits_refused,
 )
 from space_dist.learner import torch_checks
-from space_dist.ledger import FORMAT, Ledger, RunWriter, State, Status, decode_checkpoint
+from space_dist.ledger import FORMAT, GIVEN, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Cluster, InProcess, n_workers
 from space_dist.run.continuing import is_longer, takes_over, within
-from space_dist.run.starting import weights_in
 from space_dist.run.training import Progress, Training
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile, in_words
@@ -102,7 +101,8 @@ def launch(
 class ActiveRun:
     """A run that is this process's own now.
 
-    outcome: how it ends; `already_done` where there is nothing to do. pause_at, change_at: as of `Training`.
+    outcome: how it ends; `already_done` where there is nothing to do. pause_at and what
+    follows: as of `Training`.
     """
 
     blueprint: Blueprint
@@ -114,6 +114,8 @@ class ActiveRun:
     pusher: Pusher | None = None
     pause_at: int = 0
     change_at: int = 0
+    curriculum_number: int = 0
+    ends_curriculum: bool = False
 
     def parts(self) -> Iterator[ActiveRun]:
         """What is left of it: all at once, or, under a schedule, the part up to each change, under what is in force.
@@ -122,14 +124,18 @@ class ActiveRun:
         """
         config, writer = self.blueprint.config, self.writer
         while not self.outcome.already_done and not writer.current.has_reached(self.pause_at):
-            if not config.schedule:
+            if not config.changes:
                 yield self
                 return
             checkpoint = writer.restore()
             steps = 0 if checkpoint is None else int(checkpoint.data["run"]["steps"])
-            blueprint = replace(self.blueprint, config=config.at(steps))
+            blueprint = self.blueprint.under(config.at(steps))
             setup = blueprint.setup(self.setup.train, self.setup.test)
-            yield replace(self, blueprint=blueprint, setup=setup, change_at=config.change_after(steps))
+            number, change_at = config.curriculum_number(steps), config.change_after(steps)
+            yield replace(
+                self, blueprint=blueprint, setup=setup, change_at=change_at, curriculum_number=number,
+                ends_curriculum=config.curriculum_number(change_at) > number,
+            )  # fmt: skip
 
     def training(self, cluster: Cluster, observe: Callable[[Progress], None] = lambda progress: None) -> Training:
         """What is left of it. Raises Interrupted if it was asked to stop meanwhile."""
@@ -137,6 +143,7 @@ class ActiveRun:
         return Training(
             self.blueprint, self.setup, cluster, self.writer,
             status=self.status, pause_at=self.pause_at, change_at=self.change_at,
+            curriculum_number=self.curriculum_number, ends_curriculum=self.ends_curriculum,
             stop_requested=self.stop.reason, observe=observe,
         )  # fmt: skip
 
@@ -229,15 +236,15 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
 def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
     config, ledger = blueprint.config, writer.ledger
-    weights = None if config.init_from is None else weights_in(config.init_from)
+    given = blueprint.given
     now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config), config.import_paths)
     status = Status(
         state="running", name=config.name, seed=config.seed, steps=0, budget_steps=config.budget.steps, round=0,
         started_at=now, updated_at=now, fingerprint=here,
-        identity=configs.identity(config, setup.train.digest(), setup.test.digest(), weights=weights),
+        identity=configs.identity(config, setup.train.digest(), setup.test.digest(), given=given),
     )  # fmt: skip
     before = writer.status = _status_before(ledger)
-    earlier = _refuse_other_run(config, setup, weights, ledger, status.identity, before)
+    earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
     if before is not None:
         if before.has_reached(pause_at) and earlier is None:
             damage = ledger.damage()
@@ -266,7 +273,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
         what = "another schedule" if earlier.budget == config.budget else "a larger budget"
         log.info("going on under %s, from round %d", what, status.round)
     # Before the status, which names the digests of these files.
-    writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), weights)
+    writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), given)
     # It asked the process before this one.
     ledger.stop_file.unlink(missing_ok=True)
     writer.set_status(status)
@@ -277,7 +284,7 @@ def _also_decide(config: RunConfig) -> list[str]:
     """The distributions whose arithmetic this run uses, besides those that every run does."""
     compiled = config.learner.is_compiled(config.engine)
     also = {
-        "scikit-learn": "scikit-learn" in config.curriculum.libraries,
+        "scikit-learn": "scikit-learn" in config.libraries,
         "pybullet": config.env.id in BULLET_IDS,
         "numba": compiled,
         "llvmlite": compiled,
@@ -321,7 +328,12 @@ def _status_in(ledger: Ledger) -> Status | None:
 
 
 def _refuse_other_run(
-    config: RunConfig, setup: Setup, weights: bytes | None, ledger: Ledger, identity: str | None, before: Status | None
+    config: RunConfig,
+    setup: Setup,
+    given: Mapping[str, bytes],
+    ledger: Ledger,
+    identity: str | None,
+    before: Status | None,
 ) -> RunConfig | None:
     """Raise ConfigError if the folder holds a run of another configuration, with what differs where that is known.
 
@@ -334,13 +346,13 @@ def _refuse_other_run(
     try:  # the stored config decides as this version reads it, if it is known to be what the run wrote
         stored = configs.load(ledger.config) if before is None else stored_config(ledger)
         train, test = Blueprint.of(stored).instances()
-        learned = None if stored.init_from is None else ledger.read(ledger.initial_weights)
+        taken = {key: ledger.read(ledger.given[key]) for key in stored.given_paths}
     except LedgerError as error:
         raise ConfigError(
             f"{ledger.folder} holds a run of another configuration; which cannot be told: {error}"
         ) from error
     digests = train.digest(), test.digest()
-    if identity == configs.identity(stored, *digests, weights=learned):
+    if identity == configs.identity(stored, *digests, given=taken):
         if before is not None and len(before.files.get(ledger.config.name, [])) > 1:
             raise ConfigError(
                 f"{ledger.folder} had been asked to go on under a larger budget, of {before.budget_steps:,} steps, "
@@ -348,14 +360,16 @@ def _refuse_other_run(
             )
         return None  # an earlier version's identity
     heir = stored.model_copy(update={"schedule": config.schedule})
-    if identity == configs.identity(heir, *digests, weights=learned) and takes_over(stored, config, before):
+    if identity == configs.identity(heir, *digests, given=taken) and takes_over(stored, config, before):
         return stored
     longer = stored.model_copy(update={"budget": config.budget})
-    if identity == configs.identity(longer, *digests, weights=learned) and is_longer(stored, config):
+    if identity == configs.identity(longer, *digests, given=taken) and is_longer(stored, config):
         return stored
     changes = configs.differences(stored, config)
-    if learned != weights:
+    if taken.get("init_from") != given.get("init_from"):
         changes.append("init_from: other networks")
+    if taken.get("curriculum.of") != given.get("curriculum.of"):
+        changes.append("curriculum.of: another recorded curriculum")
     if (train.digest(), test.digest()) != (setup.train.digest(), setup.test.digest()):
         changes.append("instances: other contexts or ids")
     raise ConfigError(
@@ -373,11 +387,8 @@ def stored_config(ledger: Ledger) -> RunConfig:
 def _self_contained(config: RunConfig) -> RunConfig:
     """The config as stored in the run's folder: with its own instance files, and no path relative to anywhere else."""
     instances = {"train": Path("instances_train.csv"), "test": Path("instances_test.csv")}
-    return config.model_copy(
-        update={
-            "instances": config.instances.model_copy(update=instances),
-            "init_from": None if config.init_from is None else Path("init.npz"),
-        }
+    return config.with_given({key: Path(GIVEN[key]) for key in config.given_paths}).model_copy(
+        update={"instances": config.instances.model_copy(update=instances)}
     )
 
 

@@ -26,7 +26,7 @@ from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Stage, Tr
 from space_dist.rollout.walk import Walk
 from space_dist.run.cluster import Handle, InProcess
 from space_dist.run.launch import Outcome, begun, speaking
-from space_dist.run.training import Learn, Wait, Work
+from space_dist.run.requests import Learn, Wait, Work
 from space_dist.system.interrupts import StopRequests
 
 _SLOTS = 1024  # environments stepped together, at most: what the cache holds of them. Decides no result

@@ -63,7 +63,7 @@ class CurriculumActor(_Timed, Central):
     def __init__(self, config: RunConfig, setup: Setup, folders: Sequence[str]) -> None:
         look_in(folders)
         threadpool_limits(limits=1)
-        super().__init__(config, setup.train, setup.spec.context_bounds)
+        super().__init__(config, setup.train, setup.spec.context_bounds, setup.given)
 
 
 def name_of(index: int) -> str:
@@ -74,7 +74,7 @@ def name_of(index: int) -> str:
 def computes_with(config: RunConfig, setup: Setup, *, central: bool) -> tuple[str, ...]:
     """What decides the bits that an actor computes, as `computed` knows it, beside those of the environment itself."""
     if central:
-        return ("numpy", *config.curriculum.libraries)
+        return ("numpy", *config.libraries)
     from space_dist.learner import is_mlp  # torch, which actors of such policies never import
 
     also = {"torch": not is_mlp(config.learner, setup.spec.observation_space),

@@ -28,7 +28,8 @@ from space_dist import config as configs
 from space_dist.config import RunConfig
 from space_dist.envs import Drawable, KnowsOptimum, close, takes_argument, unwrapped
 from space_dist.envs.cartpole import ANGLE_LIMIT, X_LIMIT
-from space_dist.envs.layouts import CELLS, SIDE, shortest_ways, successors
+from space_dist.envs.goalmaze import BLOCK, WALL
+from space_dist.envs.layouts import cut_out, shortest_ways, successors
 from space_dist.envs.observations import take
 from space_dist.envs.pointmass import GOAL, POSITION_LIMIT, SUCCESS_DISTANCE
 from space_dist.envs.spec import read_spec
@@ -328,6 +329,36 @@ class _CartPole:
         return f"half the pole's length {episode.context[0]:.2f}"
 
 
+class _GoalMaze:
+    milliseconds, height, whole = 50, 4.4, True
+
+    def prepare(self, axes: Axes, context: NDArray[np.float64]) -> Callable[[NDArray[Any]], Sequence[Artist]]:
+        goal_x, goal_y, tolerance = context
+        _bare(axes, (-WALL - 2, WALL + 2), (-WALL - 2, WALL + 2))
+        axes.set_facecolor(_INK)
+        axes.add_patch(Rectangle((-WALL, -WALL), 2 * WALL, 2 * WALL, color="white", lw=0))
+        axes.add_patch(Rectangle((-BLOCK, -BLOCK), 2 * BLOCK, 2 * BLOCK, color=_INK, lw=0))
+        axes.add_patch(Circle((goal_x, goal_y), tolerance, color=_GOOD, alpha=0.35, lw=0))
+        axes.plot(goal_x, goal_y, marker="+", color=_GOOD, markersize=7)
+        (path,) = axes.plot([], [], color=_PATH, lw=1.2)
+        (walker,) = axes.plot([], [], marker="o", color=_PATH, markersize=4.5, linestyle="none")
+
+        def show(observations: NDArray[Any]) -> Sequence[Artist]:
+            path.set_data(observations[:, 0], observations[:, 1])
+            walker.set_data(observations[-1:, 0], observations[-1:, 1])
+            return path, walker
+
+        return show
+
+    def order(self, contexts: NDArray[np.float64]) -> list[int]:
+        """From the least tolerance to the greatest, and where it is the same, from left to right."""
+        return _spread(np.lexsort((contexts[:, 0], contexts[:, 2])))
+
+    def caption(self, episode: Episode) -> str:
+        goal_x, goal_y, tolerance = episode.context
+        return f"goal ({goal_x:.1f}, {goal_y:.1f}), tolerance {tolerance:.2g}"
+
+
 _SIDES: Final = np.array(  # of a cell around (0, 0), by action: from where to where
     [[(-0.5, -0.5), (0.5, -0.5)], [(-0.5, 0.5), (0.5, 0.5)], [(0.5, -0.5), (0.5, 0.5)], [(-0.5, -0.5), (-0.5, 0.5)]]
 )
@@ -337,11 +368,14 @@ class _Maze:
     milliseconds, height, whole = 250, 4.4, True
 
     def prepare(self, axes: Axes, context: NDArray[np.float64]) -> Callable[[NDArray[Any]], Sequence[Artist]]:
-        _bare(axes, (-0.6, SIDE - 0.4), (SIDE - 0.4, -0.6), framed=False)  # y points down
-        for place, colour in (((0, 0), _PALE), ((SIDE - 1, SIDE - 1), _GOOD)):
+        layout = self._layout(context)
+        cells = layout.shape[1]
+        side = math.isqrt(cells)
+        _bare(axes, (-0.6, side - 0.4), (side - 0.4, -0.6), framed=False)  # y points down
+        for place, colour in (((0, 0), _PALE), ((side - 1, side - 1), _GOOD)):
             axes.add_patch(Rectangle((place[0] - 0.5, place[1] - 0.5), 1, 1, color=colour, alpha=0.35, lw=0))
-        closed = successors(context[None])[0] == np.arange(CELLS)[:, None]
-        walls = [_SIDES[action] + (cell % SIDE, cell // SIDE) for cell, action in np.argwhere(closed)]
+        closed = successors(layout)[0] == np.arange(cells)[:, None]
+        walls = [_SIDES[action] + (cell % side, cell // side) for cell, action in np.argwhere(closed)]
         axes.add_collection(LineCollection(walls, colors=_INK, linewidths=1.4, capstyle="round"))
         (path,) = axes.plot([], [], color=_PATH, lw=1.6, alpha=0.7)
         (walker,) = axes.plot([], [], marker="o", color=_PATH, markersize=6, linestyle="none")
@@ -355,18 +389,30 @@ class _Maze:
 
     def order(self, contexts: NDArray[np.float64]) -> list[int]:
         """From the shortest way to the longest."""
-        return _spread(np.argsort(shortest_ways(contexts), kind="stable"))
+        best = [shortest_ways(self._layout(context))[0] for context in contexts]
+        return _spread(np.argsort(best, kind="stable"))
 
     def caption(self, episode: Episode) -> str:
-        best = shortest_ways(episode.context[None])[0]
+        best = shortest_ways(self._layout(episode.context))[0]
         return f"{episode.length} moves, " + (f"best {best:.0f}" if np.isfinite(best) else "no way")
+
+    def _layout(self, context: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`(1, cells)`."""
+        return context[None]
+
+
+class _MixedMaze(_Maze):
+    def _layout(self, context: NDArray[np.float64]) -> NDArray[np.float64]:
+        return cut_out(context[None, 1:], int(context[0]))
 
 
 _SCENES: Final[Mapping[str, Scene]] = {
     "space_dist/PointMass-v0": _PointMass(),
     "space_dist/SparsePointMass-v0": _PointMass(),
+    "space_dist/GoalMaze-v0": _GoalMaze(),
     "space_dist/CartPole-v0": _CartPole(),
     "space_dist/Maze-v0": _Maze(),
+    "space_dist/MixedMaze-v0": _MixedMaze(),
 }
 
 

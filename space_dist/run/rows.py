@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -73,3 +73,11 @@ def summary(outcomes: Outcomes, instances: int, episodes: int) -> dict[str, Any]
         "returns": each.mean(axis=(0, 2)).tolist(),
         **({"halves": [each[:, :, half::2].mean(axis=(0, 2)).tolist() for half in (0, 1)]} if episodes > 1 else {}),
     }
+
+
+def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int:
+    """Steps at which the next evaluation falls due; it is made after the first update at or behind them."""
+    if every_steps == "log":
+        marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
+        return next(mark for mark in marks if mark > evaluated_at)
+    return (evaluated_at // every_steps + 1) * every_steps

@@ -48,6 +48,10 @@ def _walk_in(name: str, checkpoint: Checkpoint, setup: Setup) -> Walk:
 
 
 _DATA = _Form(lambda name, value: ({name: value}, {}), lambda name, checkpoint, _: checkpoint.data["run"][name])
+_LATER = _Form(  # left out where it is 0, as it is in runs of earlier versions
+    lambda name, value: ({name: value} if value else {}, {}),
+    lambda name, checkpoint, _: checkpoint.data["run"].get(name, 0),
+)
 _ARRAY = _Form(
     lambda name, value: ({}, {} if value is None else {name: value}),
     lambda name, checkpoint, _: checkpoint.arrays.get(name),
@@ -80,6 +84,7 @@ class RunState:
     rows: of the ledger.  evaluated_at: steps at the last evaluation.
     rollouts, updates, gradient_steps: what this iteration's rounds and updates showed.
     sizes: (slots,) sums of |GAE| over running episodes, where anyone asks.
+    curriculum_number: curricula that were in force before the one whose state is stored.
     """
 
     scored: Arrays = field(default_factory=dict, metadata={"form": _ARRAYS})
@@ -98,6 +103,7 @@ class RunState:
     updates: list[dict[str, float]] = field(default_factory=list)
     gradient_steps: int = 0
     sizes: NDArray[np.float64] | None = field(default=None, metadata={"form": _ARRAY})
+    curriculum_number: int = field(default=0, metadata={"form": _LATER})
 
     def save(self) -> tuple[dict[str, Any], Arrays]:
         """What `restored` makes this of again: a checkpoint's `run` data, and arrays."""

@@ -3,7 +3,7 @@
     select   curriculum.start()                          one instance (SPaCE), all (round robin), ...
     repeat
         collect  cluster.collect(policy, selection, walk)  exactly n_steps transitions, in shards; episodes go on
-        update   learner.update(shards)                  SB3's own train()
+        update   learner.update(shards)                  SB3's own train(); none where the selection says so
         until the selection was passed over once at full horizon (draws: after one update), then
         revalue  cluster.start_values(policy)            V(s0, c) of every instance, straight to the curriculum
         select   cluster.decide(state, evidence)         the next selection, from that and what else was asked for
@@ -25,16 +25,16 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
 from space_dist.errors import Interrupted
-from space_dist.learner import Arrays, Learner, Update
+from space_dist.learner import Arrays, Update
 from space_dist.ledger import (
     CURRICULUM,
     METRICS,
@@ -54,7 +54,8 @@ from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
-from space_dist.run.rows import iteration_row, position, summary, trained_row
+from space_dist.run.requests import Learn, Wait, Work
+from space_dist.run.rows import iteration_row, next_evaluation, position, summary, trained_row
 from space_dist.run.starting import start_from
 from space_dist.run.state import RunState
 
@@ -97,28 +98,6 @@ class _Pending:
     settle: Callable[[list[Any]], None]
 
 
-@dataclass(frozen=True)
-class Wait:
-    """A run needs the values of `handles`, as a list, to go on."""
-
-    handles: list[Handle]
-
-
-@dataclass(frozen=True)
-class Learn:
-    """A run needs its learner's `Update` on a round's shards, to go on; see `Learner.update`."""
-
-    learner: Learner
-    shards: list[Shard]
-    round: int
-    steps: int
-    acted: Arrays | None = None
-
-
-T = TypeVar("T")
-Work = Generator[Wait | Learn, Any, T]
-
-
 class Training:
     """One run in progress. `work` is Algorithm 1; the rest keeps its books."""
 
@@ -132,13 +111,20 @@ class Training:
         status: Status,
         pause_at: int = 0,
         change_at: int = 0,
+        curriculum_number: int = 0,
+        ends_curriculum: bool = False,
         stop_requested: Callable[[], str | None] = lambda: None,
         observe: Callable[[Progress], None] = lambda progress: None,
     ) -> None:
-        """pause_at, change_at: steps at which it ends before its budget does, to be gone on with; 0: nowhere."""
+        """pause_at, change_at: steps at which it ends before its budget does, to be gone on with; 0: nowhere.
+
+        curriculum_number: curricula that were in force before this one, which begins anew in a run that has another.
+        ends_curriculum: whether another one comes into force at `change_at`.
+        """
         self._config, self._setup, self._cluster, self._writer = blueprint.config, setup, cluster, writer
         self._status, self._stop_requested, self._observe = status, stop_requested, observe
         self._pause_at, self._change_at = pause_at, change_at
+        self._curriculum_number, self._ends_curriculum = curriculum_number, ends_curriculum
         self._horizon = setup.spec.horizon
         self._total_steps = blueprint.total_steps
         self.learner = blueprint.learner()
@@ -180,7 +166,10 @@ class Training:
             self._arrived(shards, lag=1 if acted else 0)
             run.acted = self._look_ahead(policy)
             # Line 5, with SB3's own `train()`.
-            update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted or None)
+            if asked.trained is None or asked.trained.learned:
+                update = yield Learn(self.learner, shards, run.round - 1, run.steps, acted or None)
+            else:
+                update = self.learner.look_at(shards, round=run.round - 1, acted=acted or None)
             self._account(shards, self._with_ensemble(update, shards, scales))
             policy = cluster.put(self.learner.policy(run.round))
             # Lines 6 to 13.
@@ -209,7 +198,7 @@ class Training:
         cluster = self._cluster
         if self._config.init_from is not None:
             ledger = self._writer.ledger
-            start_from(self.learner, ledger.read(ledger.initial_weights))
+            start_from(self.learner, ledger.read(ledger.given["init_from"]))
         elif self.learner.normalises:
             yield from self._measure_scales()
         policy = cluster.put(self.learner.policy(0))
@@ -437,10 +426,7 @@ class Training:
 
     def _finish(self) -> Work[None]:
         run = self._run
-        if run.rollouts:  # the budget ended inside an iteration: its steps are logged, its decision is never made
-            yield from self._settle()
-            self._append({**self._iteration_row(complete=False), "curriculum": {}})
-            run.rollouts, run.updates, run.seen = [], [], []
+        yield from self._end_iteration()
         yield from self._commit("done")
         self._show()  # only now, for the last returns are known since the commit
         arrays, description = model_of(self.learner, run.round)
@@ -453,6 +439,16 @@ class Training:
         }  # fmt: skip
         self._writer.write_model(arrays, description)
         self._writer.set_status(self._new_status("done"))
+
+    def _end_iteration(self) -> Work[bool]:
+        """Log the steps of an iteration that is not complete, whose decision is never made. Returns whether one was."""
+        run = self._run
+        if not run.rollouts:
+            return False
+        yield from self._settle()
+        self._append({**self._iteration_row(complete=False), "curriculum": {}})
+        run.rollouts, run.updates, run.seen = [], [], []
+        return True
 
     # ---- waiting, and the ledger ----
 
@@ -492,6 +488,9 @@ class Training:
         """Commit where this part of the run ends, if it does: the next part goes on from there, as if resumed."""
         if self._is_over():
             return False
+        if self._ends_curriculum and 0 < self._change_at <= self._run.steps and (yield from self._end_iteration()):
+            self._run.iteration += 1
+            self._run.gradient_steps = 0
         for place, state in ((self._pause_at, "paused"), (self._change_at, "running")):
             if 0 < place <= self._run.steps:
                 yield from self._commit(state)
@@ -560,6 +559,12 @@ class Training:
         self._segments = list(checkpoint.segments)
         for segment in self._segments:
             self.learner.remember(self._writer.read_segment(segment), segment.first)
+        self._last_commit_round, self._last_row_steps = run.round, run.steps
+        self._know_returns(self._writer.ledger.rows(METRICS))
+        policy = cluster.put(self.learner.policy(run.round))
+        if run.curriculum_number != self._curriculum_number:
+            self._begin_curriculum(policy)
+            return policy
         state = decode_state(
             self._curriculum.state_type, checkpoint.under("curriculum/"), checkpoint.data["curriculum"]
         )  # fmt: skip
@@ -569,21 +574,21 @@ class Training:
         asked.values = cluster.put(checkpoint.arrays["values"])
         if self.ensemble is not None:
             self.ensemble.load(checkpoint.under("ensemble/"))
-        self._know_returns(self._writer.ledger.rows(METRICS))
-        self._last_commit_round, self._last_row_steps = run.round, run.steps
         if run.acted:
             # It was in flight when the checkpoint was made: asked again with the weights that acted then.
             asked.ahead = self._collect(cluster.put(self.learner.policy_of(run.acted, run.round - 1)), lag=1)
-        return cluster.put(self.learner.policy(run.round))
+        return policy
+
+    def _begin_curriculum(self, policy: Handle) -> None:
+        """Have this curriculum choose from here on, as if it were at its start: it replaces the one before it.
+
+        The episodes that run go on. Of their advantages only those of the steps from here on are known.
+        """
+        run, cluster = self._run, self._cluster
+        run.version, run.walk = 0, dataclasses.replace(run.walk, order_version=-1)
+        run.acted, run.sizes, run.curriculum_number = {}, None, self._curriculum_number
+        self._adopt(cluster.begin(cluster.start_values(policy)))
 
     def _show(self) -> None:
         self.progress.steps = self._run.steps
         self._observe(self.progress)
-
-
-def next_evaluation(every_steps: int | Literal["log"], evaluated_at: int) -> int:
-    """Steps at which the next evaluation falls due; it is made after the first update at or behind them."""
-    if every_steps == "log":
-        marks = (factor * round(10.0**power) for power in range(3, 16) for factor in (1, 3))
-        return next(mark for mark in marks if mark > evaluated_at)
-    return (evaluated_at // every_steps + 1) * every_steps

@@ -81,7 +81,7 @@ def _stock_learner(config: RunConfig, spec: EnvironmentSpec, checkpoint: Checkpo
 
 def _normaliser(config: RunConfig, spec: EnvironmentSpec, ledger: Ledger, learner: SB3Learner) -> VecNormalize:
     """SB3's, with the run's scales, which stand still."""
-    train = read_csv(ledger.instances("train"), spec.context_bounds, config.curriculum.columns_read)
+    train = read_csv(ledger.instances("train"), spec.context_bounds, config.columns_read)
     settings, statistics = config.learner, learner.statistics
     env = ContextVecEnv(
         config.env.id, train, context_visible=config.env.context_visible, env_kwargs=config.env.kwargs

@@ -167,8 +167,15 @@ class Session:
                 f"CurriculumCallback: {settings.kind} scores episodes by their advantages, which "
                 f"{type(model).__name__} does not compute; PPO, A2C, TRPO, MaskablePPO and RecurrentPPO do"
             )
+        if self._wants.unlearned:
+            raise ConfigError(
+                f"CurriculumCallback: {settings.kind}, as it is set, plays rounds that are not learned from, and "
+                "model.learn learns from every one: train with space-dist"
+            )
         if self._wants.probes:
             self._refuse_probes()
+        if self._wants.probes or self._wants.success:
+            self._refuse_silence()
         if settings.ranks_by_start_value:
             self._refuse_blindness()
         self._ensemble = self._made_ensemble() if isinstance(settings, ValueDisagreementConfig) else None
@@ -180,6 +187,9 @@ class Session:
                 f"CurriculumCallback: {kind} plays episodes of its own, in which {name} could not act: it asks for "
                 + ("masks" if name == "MaskablePPO" else "what it remembers of the episode")
             )
+
+    def _refuse_silence(self) -> None:
+        kind = self._asked.curriculum.kind
         with self.env.opened(1) as env:
             success_is_known = knows_success(env, self._host.curriculum.start()[1].contexts[:1])
         if not success_is_known:

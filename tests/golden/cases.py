@@ -32,7 +32,7 @@ _CONTINUOUS = "net_arch: [32, 32], batch_size: 32, learning_starts: 128, gradien
 
 # Of twelve instances none would be left out where the set grows as in the shipped configs.
 _GROWTH = ["curriculum.eta=0.1", "curriculum.kappa=1"]
-_GROWING = {"pointmass_space", "antgoal_space", "ballcatching_space"}
+_GROWING = {"pointmass_space", "antgoal_space", "ballcatching_space", "goalmaze_space", "mixed_maze_space"}
 
 _COLUMN = "difficulty"  # what `manual` goes by; in the training instances of its case alone
 
@@ -81,6 +81,8 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_PPO, "env.kwargs.horizon=24", "learner.batch_size=64", "learner.net_arch=[32, 32]",
         "learner.update=stock",
     ]),
+    "goalmaze": ("goalmaze_space", _LEAN),
+    "mixed maze": ("mixed_maze_space", [*_PPO, "env.kwargs.horizon=24", "learner.batch_size=64"]),
     # curricula
     "cspace": ("pointmass_space", [*_LEAN, _curriculum("kind: cspace, kappa: 2, eta: 4")]),
     "round robin": ("pointmass_round_robin", _LEAN),
@@ -96,7 +98,26 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_LEAN, "budget.steps=640", "curriculum.fit_rate=12", "curriculum.components=3",
     ]),
     "plr": ("curricula/pointmass_plr", _LEAN),
+    "plr robust": ("curricula/pointmass_plr_robust", [
+        *_LEAN, "budget.steps=1024", "curriculum.replay_share=0.7",
+    ]),
     "procurl": ("sparse_pointmass_procurl", _LEAN),
+    "procurl space-alt": ("curricula/pointmass_space_alt", _LEAN),
+    "learning_progress": ("curricula/pointmass_learning_progress", [
+        *_LEAN, "budget.steps=512", "curriculum.outcome=return", "curriculum.lowest_return=0.25",
+        "curriculum.largest_return=0.4",
+    ]),
+    "currot": ("curricula/pointmass_currot", [
+        *_LEAN, "budget.steps=512", "curriculum.delta=0.253", "curriculum.particles=16",
+    ]),
+    "currot over the set": ("curricula/pointmass_currot", [
+        *_LEAN, "budget.steps=512", _curriculum("kind: currot, delta: 0.253, particles: 16"),
+    ]),
+    "replayed draws": ("curricula/pointmass_plr", _LEAN),
+    "forked": ("pointmass_space", [
+        *_LEAN, "fork={seed: 3, steps: 100}",
+        "schedule=[{steps: 200, set: {curriculum: {kind: uniform}, learner.learning_rate: 0.001}}]",
+    ]),
     "learnability": ("cartpole_dqn_space", [
         *(setting for setting in _SMALL if "horizon" not in setting), "env.kwargs.horizon=20", "budget.episodes=null",
         "learner={kind: ppo, n_steps: 128, n_epochs: 2, net_arch: [16, 16]}", "budget.steps=1024",
@@ -105,6 +126,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     ]),
 }  # fmt: skip
 """Name -> (shipped config, settings)."""
+_FOLLOWED = {"replayed draws": "plr"}  # the case whose curriculum another one's runs follow
 
 
 @functools.cache
@@ -143,5 +165,9 @@ def digests_of(folder: Path) -> dict[str, str]:
 def run(name: str, folder: Path) -> dict[str, str]:
     """Run a case in `folder`, in this process; the digests of what it wrote."""
     folder.mkdir(parents=True)
-    launch(config_of(name, folder), folder / "run", resume=False, stop=StopRequests())
+    also: tuple[str, ...] = ()
+    if name in _FOLLOWED:
+        launch(config_of(_FOLLOWED[name], folder), folder / "followed", resume=False, stop=StopRequests())
+        also = (_curriculum(f"kind: replay, of: {folder / 'followed'}"), "seed=1")
+    launch(config_of(name, folder, also), folder / "run", resume=False, stop=StopRequests())
     return digests_of(folder / "run")

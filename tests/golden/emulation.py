@@ -45,9 +45,11 @@ print(json.dumps({"NUMBA_CPU_NAME": llvm.get_host_cpu_name(), "NUMBA_CPU_FEATURE
 """
 _COMPILE = """
 import numpy as np
-from space_dist.kernels import dqn, ppo, sac, td3
+from space_dist.kernels import dqn, goalmaze, pointmass, ppo, sac, td3
 for algorithm in (dqn, ppo, sac, td3):
     algorithm.prepare(np.float32)
+for world in (goalmaze, pointmass):
+    world.prepare()
 """
 
 

@@ -1,0 +1,130 @@
+"""Measure, before anything is claimed, how much a curriculum could save: a short run of uniform draws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from space_dist import config as configs
+from space_dist.api.grids import GridRun, run_grid
+from space_dist.api.training import Config, Overrides, as_config
+from space_dist.config import RunConfig
+from space_dist.curricula import decode_state
+from space_dist.curricula.watching import WatchedState
+from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.instances import InstanceSet
+from space_dist.report import headroom as reports
+from space_dist.report.figures import save
+from space_dist.report.headroom import Headroom
+from space_dist.report.headroom_figure import draw_headroom
+from space_dist.report.tables import to_csv
+from space_dist.run.building import Blueprint
+
+SHARES: Final = 10  # of the steps, over which signal is followed
+_BASE, _GRID, _NAME = "config.yaml", "headroom.yaml", "headroom"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured, and of which instances. folder: where everything about it lies."""
+
+    headroom: Headroom
+    train: InstanceSet
+    states: list[WatchedState]
+    folder: Path
+
+
+def measure_headroom(
+    config: Config,
+    *,
+    out: Path | str,
+    steps: int | None = None,
+    seeds: int = 5,
+    overrides: Overrides = (),
+    progress: bool = True,
+) -> Measured:
+    """Train with uniform draws, and count what every instance shows: see `space_dist.report.headroom`.
+
+    config, overrides: as of `train`; its curriculum plays no part.  out: a folder; measured twice, it goes on where it
+    stopped.  steps: environment steps of each run; None: a fifth of the config's budget.  seeds: how many runs.
+
+    Raises ConfigError for every fault of the config, SpaceDistError if a run fails.
+    """
+    settings = as_config(config, overrides)
+    folder = Path(out).absolute()
+    blueprint = _watched(settings, steps)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _BASE).write_text(configs.dump(blueprint.config))
+    (folder / _GRID).write_text(configs.to_yaml({
+        "name": _NAME, "extends": _BASE, "seeds": {"count": seeds}, "tracking": {"uri": None},
+    }))  # fmt: skip
+    grid = run_grid(folder / _GRID, root=folder, progress=progress)
+    states = _states(grid)
+    train, _ = blueprint.instances()
+    found = Measured(reports.measured(states, blueprint.total_steps), train, states, folder)
+    (folder / "instances.csv").write_text(to_csv(_rows(found)))
+    save(draw_headroom(found.headroom, states), folder / "headroom.png")
+    return found
+
+
+def _watched(config: RunConfig, steps: int | None) -> Blueprint:
+    """The config that is measured with: uniform draws that are counted, few evaluations, and no mirror."""
+    first = Blueprint.of(config)
+    if config.n_policies > 1:
+        raise ConfigError("headroom: curriculum.aggregate: population trains several policies; use aggregate: own")
+    by_episodes = config.n_episodes is not None
+    round_steps = config.round_steps(first.spec.horizon)
+    budget = max(config.budget.steps // 5, round_steps) if steps is None else steps
+    iterations = budget // round_steps
+    shares = 1 if by_episodes else min(SHARES, max(1, iterations))
+    data = config.model_dump(mode="json")
+    data |= {
+        "name": _NAME,
+        # Decided when the grid is frozen: a config that names an update keeps it.
+        "engine": "auto" if config.engine == "single" and not config.learner.is_compiled("single") else config.engine,
+        "curriculum": {
+            "kind": "watched", "iterations": max(1, iterations), "shares": shares,
+            "advantages": config.learner.has_advantages,
+        },
+        "budget": {**data["budget"], "steps": budget, "episodes": None},
+        "schedule": [], "fork": None,
+        "evaluation": {**data["evaluation"], "every_steps": budget},
+        "rollout": {**data["rollout"], "overlap": False},
+        "tracking": {"uri": None},
+    }  # fmt: skip
+    return Blueprint.of(configs.parse(data, "headroom"), first.spec)
+
+
+def _states(grid: GridRun) -> list[WatchedState]:
+    states = []
+    for status in grid.statuses:
+        checkpoint = status.ledger.last_checkpoint() if status.condition == "done" else None
+        if checkpoint is None:
+            raise SpaceDistError(
+                f"headroom: {status.run.title} is {status.in_words}: {status.detail or 'run it again'}"
+            )
+        states.append(decode_state(WatchedState, checkpoint.under("curriculum/"), checkpoint.data["curriculum"]))
+    return states
+
+
+def _rows(found: Measured) -> list[dict[str, Any]]:
+    """One row per instance: its context, and over all seeds how often it was played and succeeded, share by share."""
+    episodes = np.sum([state.episodes for state in found.states], axis=0)
+    successes = np.sum([state.successes for state in found.states], axis=0)
+    known = all(state.knows_success for state in found.states)
+    rows = []
+    for place, instance in enumerate(found.train.ids):
+        row: dict[str, Any] = {"id": int(instance)}
+        row |= dict(zip(found.train.names, found.train.contexts[place].tolist(), strict=True))
+        row |= {"episodes": int(episodes[:, place].sum())}
+        if known:
+            row |= {"successes": int(successes[:, place].sum())}
+            row |= {
+                f"success_{share + 1}": float(won / played) if played else None
+                for share, (won, played) in enumerate(zip(successes[:, place], episodes[:, place], strict=True))
+            }
+        rows.append(row)
+    return rows

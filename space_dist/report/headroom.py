@@ -1,0 +1,209 @@
+"""How much of what a learner plays can teach it, and so how much a curriculum could save: measured, not guessed.
+
+**Signal.** Where an episode succeeds or fails, it says something only if it could have ended otherwise: p (1 - p), with
+p an instance's probability of success, is 0 where everything fails and where everything succeeds, and 1/4 at most.
+Tzannetos et al. (2023, section 3.2) show that a policy-gradient step gains in proportion to it. The *signal* is the
+mean of 4 p (1 - p) over the instances: the share of what the best draws would have given that uniform ones gave.
+A learner that drew only instances at p = 1/2 would have as much from `signal` times the steps; no curriculum over these
+instances can save more, as long as what it learns on one is worth no more on another.
+
+**Evenness.** Where there is no success, or none that is all or nothing: (sum of s)^2 / (n * sum of s^2), with s an
+instance's mean |GAE|. 1: all teach alike, and there is nothing to choose; 1/n: one teaches all.
+
+Where episodes that fail are paid differently (a dense reward), they teach as well, however few succeed: then evenness
+decides, and the signal of outcomes bounds nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from space_dist.curricula.watching import WatchedState
+from space_dist.report.statistics import Interval, estimate
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LITTLE: Final = 0.5  # signal or evenness below which there is much to choose
+ALIKE: Final = 0.01  # of the span of all returns: failures that differ by less are paid alike
+
+
+@dataclass(frozen=True)
+class Headroom:
+    """What s uniform runs of one config showed, in w shares of their steps.
+
+    steps: of one run.  signal: `(s, w)`, NaN where no instance had two episodes or success is not known.  evenness:
+    `(s, w)`, NaN without advantages.  solved: `(s, w)` share of episodes that succeeded.  never, always: `(s, w)` share
+    of the instances with episodes of which none, or each, succeeded.  first: `(s,)` steps by the end of the share in
+    which the first success fell; NaN: there was none.  failures: least and greatest return of an episode that failed,
+    where these are not all alike: then failures teach.
+    """
+
+    steps: int
+    signal: FloatArray
+    evenness: FloatArray
+    solved: FloatArray
+    never: FloatArray
+    always: FloatArray
+    first: FloatArray
+    failures: tuple[float, float] | None = None
+
+    def over_all(self, measure: FloatArray) -> Interval:
+        """Its mean over time, IQM over seeds; a share of time that has no such number is left out."""
+        with np.errstate(invalid="ignore"):
+            known = ~np.isnan(measure)
+            means = np.where(known, measure, 0.0).sum(axis=1) / known.sum(axis=1)
+        return estimate(means).iqm.within(0.0, 1.0)
+
+
+def signal(episodes: IntArray, successes: IntArray) -> FloatArray:
+    """`(w,)` the mean over instances of 4 p (1 - p), from `(w, n)` counts.
+
+    s (m - s) / (m (m - 1)) has p (1 - p) for its expectation, of m >= 2 episodes of which s succeeded; an instance with
+    fewer says nothing. NaN where all say nothing.
+    """
+    enough = episodes >= 2
+    pairs = np.where(enough, episodes * (episodes - 1), 1)
+    each = np.where(enough, 4.0 * successes * (episodes - successes) / pairs, 0.0)
+    return _mean(each, enough)
+
+
+def evenness(episodes: IntArray, sizes: FloatArray) -> FloatArray:
+    """`(w,)` in (0, 1], from `(w, n)` counts and sums of mean |GAE|; instances without episodes are left out.
+
+    NaN where all are, or have advantages of 0.
+    """
+    played = episodes > 0
+    each = np.where(played, sizes / np.maximum(episodes, 1), 0.0)
+    total, squares = each.sum(axis=1), (each**2).sum(axis=1)
+    found: FloatArray = np.full(len(each), np.nan)
+    np.divide(total**2, played.sum(axis=1) * squares, out=found, where=squares > 0.0)
+    return found
+
+
+def _mean(values: FloatArray, counted: NDArray[np.bool_]) -> FloatArray:
+    count = counted.sum(axis=1)
+    found: FloatArray = np.full(len(values), np.nan)
+    np.divide(np.where(counted, values, 0.0).sum(axis=1), count, out=found, where=count > 0)
+    return found
+
+
+def measured(states: list[WatchedState], steps: int) -> Headroom:
+    """The headroom that runs of so many steps each showed."""
+    rows = [_of_run(state, steps) for state in states]
+    arrays: dict[str, FloatArray] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return Headroom(steps=steps, failures=_failures(states), **arrays)
+
+
+def _failures(states: list[WatchedState]) -> tuple[float, float] | None:
+    """Least and greatest return of a failure, where failures are not paid alike and success is known."""
+    low, high = min(state.failed[0] for state in states), max(state.failed[1] for state in states)
+    span = max(state.every[1] for state in states) - min(state.every[0] for state in states)
+    known = all(state.knows_success for state in states)
+    return (float(low), float(high)) if known and high - low > ALIKE * span else None
+
+
+def _of_run(state: WatchedState, steps: int) -> dict[str, Any]:
+    episodes, successes = state.episodes, state.successes
+    unknown = np.full(len(episodes), np.nan)
+    played = episodes > 0
+    uneven = evenness(episodes, state.sizes)
+    if not state.knows_success:
+        nothing = dict.fromkeys(("signal", "solved", "never", "always"), unknown)
+        return {**nothing, "evenness": uneven, "first": float("nan")}
+    won = np.flatnonzero(successes.any(axis=1))
+    first = (won[0] + 1) * steps / len(episodes) if len(won) else float("nan")
+    return {
+        "signal": signal(episodes, successes),
+        "evenness": uneven,
+        "solved": np.divide(successes.sum(axis=1), episodes.sum(axis=1), out=unknown.copy(), where=played.any(axis=1)),
+        "never": _mean((successes == 0).astype(np.float64), played),
+        "always": _mean((successes == episodes).astype(np.float64), played),
+        "first": first,
+    }
+
+
+def in_words(found: Headroom) -> list[str]:
+    """What it means, in sentences."""
+    seeds = len(found.first)
+    told = []
+    if found.failures is not None:
+        low, high = found.failures
+        told.append(
+            f"Episodes that fail have returns from {low:.3g} to {high:.3g} here, so they teach as well, however few "
+            "succeed: the signal of outcomes bounds nothing."
+        )
+    elif np.isnan(found.signal).all():
+        told.append("Whether an episode succeeds is not known here, so only the sizes of advantages can tell.")
+    else:
+        missed = int(np.isnan(found.first).sum())
+        if missed == seeds:
+            told.append(
+                f"Nothing succeeded in {found.steps:,} steps, so nothing says what a curriculum could save behind the "
+                "first success. Whether it comes sooner is a matter of discovery: breadth, easier instances, luck."
+            )
+            return told
+        share = found.over_all(found.signal)
+        told.append(
+            f"Uniform draws gave {share.value:.0%}{_span(share)} of the signal that draws at even odds would have "
+            f"given: over these {found.steps:,} steps no curriculum over these instances can need less than that share "
+            "of the steps, unless what is learned on some carries over to others."
+        )
+        late = found.first[~np.isnan(found.first)]
+        told.append(
+            f"The first success fell within the first {np.median(late):,.0f} steps (median of the seeds that had one"
+            + (f"; {missed} of {seeds} had none" if missed else "")
+            + "). What comes before it is a matter of discovery, on which this says nothing."
+        )
+    if not np.isnan(found.evenness).all():
+        even = found.over_all(found.evenness)
+        told.append(
+            f"Evenness of the advantages over the instances: {even.value:.2f}{_span(even, percent=False)}; 1 is where "
+            "all teach alike."
+        )
+    return [*told, verdict(found)]
+
+
+def verdict(found: Headroom) -> str:
+    """One sentence: whether to expect anything of a curriculum."""
+    by_outcome = found.failures is None and not np.isnan(found.signal).all()
+    known = found.signal if by_outcome else found.evenness
+    if np.isnan(known).all():
+        return "Neither success nor advantages are known: nothing can be said."
+    share = found.over_all(known).value
+    if share >= LITTLE:
+        return "Most of what is drawn teaches: expect little of a curriculum here."
+    return "Most of what is drawn teaches little: there is room for a curriculum."
+
+
+def _span(found: Interval, *, percent: bool = True) -> str:
+    if found.low is None or found.high is None:
+        return ""
+    return f" [{found.low:.0%}, {found.high:.0%}]" if percent else f" [{found.low:.2f}, {found.high:.2f}]"
+
+
+def table(found: Headroom) -> list[dict[str, str]]:
+    """A row for each share of the steps: means over the seeds."""
+    shares = found.signal.shape[1]
+    columns = {"signal": found.signal, "success": found.solved, "never": found.never, "always": found.always}
+    rows = []
+    for share in range(shares):
+        row = {"steps": f"{(share + 1) * found.steps // shares:,}"}
+        row |= {name: _percent(values[:, share]) for name, values in columns.items()}
+        row["evenness"] = (
+            "-" if np.isnan(found.evenness[:, share]).all() else f"{_average(found.evenness[:, share]):.2f}"
+        )
+        rows.append(row)
+    return rows
+
+
+def _percent(values: FloatArray) -> str:
+    return "-" if np.isnan(values).all() else f"{_average(values):.0%}"
+
+
+def _average(values: FloatArray) -> float:
+    return float(values[~np.isnan(values)].mean())
