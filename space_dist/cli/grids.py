@@ -95,8 +95,8 @@ def grid_plan(grid: GridPath, root: Root = None, scale: Scale = 1.0, as_json: Js
         return
     print_cells(manifest, found)
     say(
-        f"{len(manifest.cells)} cells x {len(manifest.seeds)} seeds = {len(found)} runs, {made.steps:,} environment "
-        f"steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
+        f"{_of(len(manifest.cells), 'cell')} x {_of(len(manifest.seeds), 'seed')} = {_of(len(found), 'run')}, "
+        f"{made.steps:,} environment steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
         + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )
     other = sum(run_status.other_code for run_status in done)
@@ -104,6 +104,10 @@ def grid_plan(grid: GridPath, root: Root = None, scale: Scale = 1.0, as_json: Js
     if made.dropped_runs:
         say(f"{made.dropped_runs} runs of the grid as it was frozen before are no longer in it; their folders are kept")
     say(f"frozen in {made.grid.folder}")
+
+
+def _of(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 @grid_app.command("run")

@@ -146,7 +146,9 @@ def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
 
 def _cell_row(cell: Cell, found: Sequence[RunStatus]) -> dict[str, str]:
     counts = Counter(run_status.condition for run_status in found)
-    steps, of_all = (sum(getattr(one, name) for one in found) for name in ("steps", "budget_steps"))
+    steps = sum(run_status.steps for run_status in found)
+    # A run that is done has none left, though another update may not have fitted into its budget.
+    of_all = sum(one.steps if one.condition == "done" else one.budget_steps for one in found)
     return {
         "cell": cell.label, "id": cell.id, "done": f"{counts['done']}/{len(found)}",
         **{condition: str(counts[condition] or "") for condition in ("running", "waiting", "failed")},

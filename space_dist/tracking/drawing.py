@@ -53,6 +53,8 @@ def _draw_episodes(run: Run, folder: Path) -> list[Path]:
     except subprocess.CalledProcessError as error:
         said = error.stderr.decode(errors="replace").strip()
         log.warning("%s: its episodes were not drawn: %s", ledger.folder, said[:300])
-    except (subprocess.TimeoutExpired, OSError) as error:
+    except subprocess.TimeoutExpired:
+        log.warning("%s: its episodes were not drawn: that took longer than %.0f s", ledger.folder, _DRAW_SECONDS)
+    except OSError as error:
         log.warning("%s: its episodes were not drawn: %s", ledger.folder, error)
     return sorted([*folder.glob("*.gif"), *folder.glob("*.png")])  # whole ones, also of a process that was ended
