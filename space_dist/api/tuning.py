@@ -109,7 +109,8 @@ def in_words(manifest: Manifest) -> str:
     racing = ""
     if open_now:
         upto = f" up to {open_now[0].steps:,} steps" if open_now[0].steps else ""
-        racing = f", {len(open_now)} open with {open_now[0].seeds} seed{'s' if open_now[0].seeds > 1 else ''} each{upto}"
+        seeds = "1 seed" if open_now[0].seeds == 1 else f"{open_now[0].seeds} seeds"
+        racing = f", {len(open_now)} open with {seeds} each{upto}"
     if search.config["population"] is not None:
         return f"{manifest.name}: {len(search.trials)} members so far, {over} over{racing}"
     generations = -(-int(search.config["trials"]) // int(search.config["generation"]))
