@@ -427,8 +427,9 @@ class Training:
     def _finish(self) -> Work[None]:
         run = self._run
         yield from self._end_iteration()
+        yield from self._settle()
+        self._show()  # only now, for the last returns are known
         yield from self._commit("done")
-        self._show()  # only now, for the last returns are known since the commit
         arrays, description = model_of(self.learner, run.round)
         description |= {"config": self._config.name, "seed": self._config.seed, "env": self._config.env.id}
         bounds = self._setup.spec.context_bounds
