@@ -102,11 +102,11 @@ class Session:
         self._restored_random: Mapping[str, Any] | None = None  # to go on with, behind the next `begin_round`
         self._open = False  # whether a rollout is being collected
         self._plan: RoundPlan | None = None  # of the round that is played
-        self._sizes_now: list[FloatArray] = []  # |GAE| of this round's rollouts
+        self._sizes_now: list[FloatArray] = []  # what counts of the advantages of this round's rollouts
         self._make()
         self.round = 0
         self.walk = Walk(-1, ())
-        self.sizes: FloatArray | None = None  # (n_envs,) sums of |GAE| over running episodes
+        self.sizes: FloatArray | None = None  # (n_envs,) sums of what counts of them over running episodes
         self.seen: list[Episodes] = []  # of this iteration's rounds
         self.gradient_steps = gradient_steps(model)  # as of the last decision
         self.scored: dict[str, NDArray[Any]] = {}  # weights that `values` belong to, where scales change
@@ -303,10 +303,10 @@ class Session:
         self._open = False
         if self._wants.advantages:
             model: Any = self._model
-            sizes: FloatArray = (
-                np.abs(model.rollout_buffer.advantages, dtype=np.float64) * self.wrapped.statistics.reward_std
+            advantages: FloatArray = (
+                model.rollout_buffer.advantages.astype(np.float64) * self.wrapped.statistics.reward_std
             )
-            self._sizes_now.append(sizes)
+            self._sizes_now.append(self._wants.counted(advantages))
 
     def on_training_end(self) -> bool:
         """A round ends with `learn`, unless its last rollout was broken off and will never be learnt from."""
