@@ -189,7 +189,7 @@ def test_every_instance_is_begun_once_before_any_is_begun_again(
         assert len(together) > 90 or len(set(together)) == len(together)  # the shards do not begin equally many
 
 
-# ---- positive_value_loss, max_mc, and robust ----------------------------------------------------------------------------------------------
+# ---- positive_value_loss, max_mc, and robust -------------------------------------------------------------------------
 
 
 def plr(n: int = 6, **changes: Any) -> LevelReplay:

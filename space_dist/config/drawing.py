@@ -161,10 +161,10 @@ class LevelReplayConfig(CurriculumSection):
     leaves the ranking until everything else was. fixed_chances: the paper's chances as they stand, by which one
     instance has nearly all episodes of an update. Source: ours; Jiang et al. 2021, who decide before each episode."""
     score: Literal["value_l1", "positive_value_loss", "max_mc"] = "value_l1"
-    """What instances are ranked by. value_l1: mean |GAE| of the episodes. positive_value_loss: mean max(GAE, 0). max_mc:
-    the highest discounted return that an episode on it had so far, minus its start value. Source: Jiang et al. 2021;
-    for the others Jiang et al. 2021, "Replay-Guided Adversarial Environment Design", whose max_mc is a mean over all
-    steps of an episode."""
+    """What instances are ranked by. value_l1: mean |GAE| of the episodes. positive_value_loss: mean max(GAE, 0) of them.
+    max_mc: the highest discounted return that an episode on it had so far, minus its start value. Source: Jiang et al.
+    2021; for the others Jiang et al. 2021, "Replay-Guided Adversarial Environment Design", whose max_mc is a mean over
+    all steps of an episode."""
     robust: bool = False
     """Learn from replayed instances only: rounds of uniform draws over the set are played and scored, charged to the
     budget, and not learned from. Source: the same (robust PLR)."""

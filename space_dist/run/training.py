@@ -416,7 +416,7 @@ class Training:
         run.gradient_steps += update.gradient_steps
 
     def _advantages(self, shards: list[Shard], update: Update) -> NDArray[np.float64] | None:
-        """`(m,)` as `Episodes.advantages`, of each that ended, if the curriculum asks for it, earlier rounds included."""
+        """`(m,)` as `Episodes.advantages`, of each that ended, if the curriculum asks for it; earlier rounds count."""
         run, wants = self._run, self._curriculum.wants
         if not wants.advantages or update.advantages is None:
             return None
