@@ -50,6 +50,8 @@ KINDS = {
     "currot": "{kind: currot, delta: 0.5, particles: 12}",
     "currot_bounds": "{kind: currot, delta: 0.5, particles: 12, over: bounds, target: normal, target_mean: [1, 0],"
     " target_std: [0.1, 1]}",
+    "accel": "{kind: accel, buffer: 6, batch: 4}",
+    "accel_set": "{kind: accel, buffer: 6, batch: 4, new_from: set, edited: batch, score: max_mc, robust: false}",
     "manual": "{kind: manual, column: effort}",
     "watched": "{kind: watched, iterations: 4, shares: 2}",
 }

@@ -46,6 +46,7 @@ KINDS = {
     "learning_progress": "{kind: learning_progress}",
     "currot over the set": "{kind: currot, delta: 4}",
     "currot over the bounds": "{kind: currot, delta: 4, over: bounds}",
+    "accel": "{kind: accel}",
     "alp_gmm": "{kind: alp_gmm}",
     "alp_gmm over the bounds": "{kind: alp_gmm, over: bounds}",
     "vds": "{kind: vds}",

@@ -19,6 +19,7 @@ from space_dist.config.curriculum import (
     WatchedConfig,
 )
 from space_dist.config.drawing import (
+    AccelConfig,
     AlpGmmConfig,
     LearnabilityConfig,
     LearningProgressConfig,
@@ -87,6 +88,7 @@ __all__ = [
     "NAME",
     "NOT_IDENTITY",
     "A2CConfig",
+    "AccelConfig",
     "AlpGmmConfig",
     "BudgetConfig",
     "Change",

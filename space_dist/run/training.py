@@ -129,7 +129,7 @@ class Training:
         self._total_steps = blueprint.total_steps
         self.learner = blueprint.learner()
         self.ensemble = blueprint.ensemble()
-        self._curriculum = blueprint.curriculum(setup.train)
+        self._curriculum = blueprint.curriculum(setup.train, setup.test)
         self._run, self._asked = RunState(), _InFlight()
         self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()

@@ -46,6 +46,7 @@ from space_dist.curricula import (
 )
 from space_dist.curricula.configured import Makers
 from space_dist.envs import BatchedEnv
+from space_dist.envs.generating import EnvironmentGenerator
 from space_dist.envs.interface import knows_success, starts_alike
 from space_dist.envs.observations import put, take
 from space_dist.envs.spec import EnvironmentSpec
@@ -89,6 +90,10 @@ class _ScriptsSpec(EnvironmentSpec):
     def make(self, n_slots: int) -> BatchedEnv:
         """See `EnvironmentSpec`."""
         return self.maker(n_slots)
+
+    def generator(self) -> EnvironmentGenerator:
+        """See `EnvironmentSpec`."""
+        return EnvironmentGenerator(self.opened, "ContextVecEnv's environment")
 
 
 class Session:
@@ -146,16 +151,16 @@ class Session:
                 "script has one; use aggregate: own"
             )
         source = "ContextVecEnv's instances"
-        makers = Makers(
-            env.instances, source=source, seed=env.run_seed, draws=Draws(self._length * env.num_envs, 1),
-            bounds=env.bounds,
-        )  # fmt: skip
-        self._host = CurriculumHost(makers.make(settings), settings)
-        self._wants = self._host.curriculum.wants
         spec = _ScriptsSpec(
             "", env.context_visible, {}, env.horizon, env.observation_space, env.action_space, env.bounds,
             maker=env.make_batched,
         )  # fmt: skip
+        makers = Makers(
+            env.instances, source=source, seed=env.run_seed, draws=Draws(self._length * env.num_envs, 1),
+            bounds=env.bounds, generator=spec.generator,
+        )  # fmt: skip
+        self._host = CurriculumHost(makers.make(settings), settings)
+        self._wants = self._host.curriculum.wants
         setup = Setup(
             spec=spec, seed=env.run_seed, gamma=self._gamma, shards=1, slots=env.num_envs, slot_length=self._length,
             start_states=self._asked.start_states, evaluation_episodes=1, train=env.instances, test=env.instances,
