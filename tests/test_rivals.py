@@ -481,9 +481,9 @@ def test_the_first_fit_comes_after_fit_rate_finished_episodes(from_set: bool) ->
 
 def made(curriculum: str, train: InstanceSet, seed: int = 0) -> Curriculum:
     settings = configs.load(SPACE, [f"curriculum={curriculum}"]).curriculum
-    return Makers(
-        train, source="train.csv", seed=seed, draws=Draws(20, 2), bounds=BOUNDS, generator=Generator
-    ).make(settings)
+    return Makers(train, source="train.csv", seed=seed, draws=Draws(20, 2), bounds=BOUNDS, generator=Generator).make(
+        settings
+    )
 
 
 def sets(curriculum: Curriculum, values: list[list[float]]) -> list[list[int]]:

@@ -251,7 +251,7 @@ def draw_curriculum(run: Run) -> Figure:
 def draw_contexts(run: Run) -> Figure:
     """Generated contexts over real environment steps: mean and standard deviation of each feature in each iteration.
 
-    Of more than 16 features the first 16, which the title says. With the target's, and the divergence from it, where the
+    Of more than 16 features the first 16, as the title says. With the target's, and the divergence from it, where the
     curriculum logged them. Raises LedgerError if no context was generated, or not in every iteration.
     """
     generated, features, decisions = run.contexts, run.features, run.decisions
