@@ -40,7 +40,7 @@ class EnvironmentGenerator:
     def __init__(self, opened: Callable[[int], AbstractContextManager[BatchedEnv]], where: str) -> None:
         self._opened, self._where = opened, where
         with opened(1) as env:
-            if _own(env, "draw_contexts") is not None and _own(env, "edit_contexts") is None:
+            if own_method(env, "draw_contexts") is not None and own_method(env, "edit_contexts") is None:
                 raise ConfigError(
                     f"{where} draws its contexts itself, since not all numbers within their bounds make one, and has "
                     "no edit_contexts(rng, contexts, edits): nobody else can edit them"
@@ -49,7 +49,7 @@ class EnvironmentGenerator:
     def sample(self, random: np.random.Generator, count: int) -> FloatArray:
         """See `ContextGenerator`."""
         with self._opened(1) as env:
-            bounds, draw = env.context_bounds, _own(env, "draw_contexts")
+            bounds, draw = env.context_bounds, own_method(env, "draw_contexts")
             if draw is not None:
                 return self._checked("draw_contexts", lambda: draw(random, count), bounds, count)
             if _whole(env):
@@ -60,7 +60,7 @@ class EnvironmentGenerator:
     def edit(self, random: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:
         """See `ContextGenerator`."""
         with self._opened(1) as env:
-            bounds, edit = env.context_bounds, _own(env, "edit_contexts")
+            bounds, edit = env.context_bounds, own_method(env, "edit_contexts")
             if edit is None:
                 return moved(random, contexts, edits, bounds, whole=_whole(env))
             own = contexts.copy()
@@ -69,7 +69,7 @@ class EnvironmentGenerator:
     def canonical(self, contexts: FloatArray) -> FloatArray:
         """See `ContextGenerator`."""
         with self._opened(1) as env:
-            canonical = _own(env, "canonical")
+            canonical = own_method(env, "canonical")
             if canonical is None:
                 return contexts
             own = contexts.copy()
@@ -125,7 +125,7 @@ def _whole(env: BatchedEnv) -> bool:
     return isinstance(inner, BatchedSingles) and inner.whole_contexts
 
 
-def _own(env: BatchedEnv, method: str) -> Callable[..., Any] | None:
+def own_method(env: BatchedEnv, method: str) -> Callable[..., Any] | None:
     """A method of the environment itself, or of the single one that it steps; None where it has none."""
     inner = env.unwrapped if isinstance(env, ContextVisible) else env
     found: Callable[..., Any] | None = None
