@@ -79,7 +79,7 @@ class BatchedMixedMaze(BatchedMaze):
         for edited, context in zip(found, contexts, strict=True):
             side = int(context[0])
             layout = symmetrised(cut_out(context[None, 1:], side))[0]
-            moves = int(rng.binomial(edits, GOAL_SHARE))
+            moves = int((rng.random(edits) < GOAL_SHARE).sum())
             for _ in range(moves):
                 larger = side == LEAST or (side < MOST and bool(rng.integers(2)))
                 layout = grown(rng, layout) if larger else symmetrised(cut_out(layout[None], side - 1))[0]

@@ -114,7 +114,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_LEAN, "budget.steps=512", _curriculum("kind: currot, delta: 0.253, particles: 16"),
     ]),
     "accel": ("curricula/mixed_maze_accel", [
-        *_LEAN, "budget.steps=1280", "env.kwargs.horizon=24", "curriculum.buffer=8", "curriculum.batch=6",
+        *_LEAN, "budget.steps=1024", "env.kwargs.horizon=14", "curriculum.buffer=8", "curriculum.batch=6",
     ]),
     "accel from the set": ("curricula/mixed_maze_accel", [
         *_LEAN, "budget.steps=1024", "env.kwargs.horizon=24",
