@@ -93,6 +93,7 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
 DRAWING = (
     {"kind": "procurl", "score": "improvement", "scale": "set"},
     {"kind": "learning_progress", "smoothing": 0.5},
+    {"kind": "edge", "memory": 0.5},
     {"kind": "plr", "robust": True, "scored_share": 0.3, "temperature": 1.0},
     {"kind": "plr", "robust": True, "scored_share": 0.3, "score": "max_mc", "within_update": "fixed_chances"},
     {"kind": "currot", "delta": -1.0, "particles": 8, "over": "bounds"},
@@ -109,7 +110,7 @@ def test_members_that_draw_are_what_their_runs_are_alone(kind: str, tmp_path: Pa
     folders = [tmp_path / f"run{number}" for number in range(len(DRAWING))]
     assert all(isinstance(end, Outcome) for end in together(configs, folders).values())
     assert [results(folder) for folder in folders] == expected
-    for folder in (*folders[2:4], folders[5]):
+    for folder in (*folders[3:5], folders[6]):
         learned = {row["gradient_steps"] > 0 for row in Ledger(folder).rows() if row["kind"] == "iteration"}
         assert learned == {False, True}
 

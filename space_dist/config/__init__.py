@@ -21,6 +21,7 @@ from space_dist.config.curriculum import (
 from space_dist.config.drawing import (
     AccelConfig,
     AlpGmmConfig,
+    EdgeConfig,
     LearnabilityConfig,
     LearningProgressConfig,
     LevelReplayConfig,
@@ -97,6 +98,7 @@ __all__ = [
     "CurriculumConfig",
     "CustomConfig",
     "DQNConfig",
+    "EdgeConfig",
     "EnvConfig",
     "EvaluationConfig",
     "FixedConfig",

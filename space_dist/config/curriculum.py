@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from space_dist.config.drawing import (
     AccelConfig,
     AlpGmmConfig,
+    EdgeConfig,
     LearnabilityConfig,
     LearningProgressConfig,
     LevelReplayConfig,
@@ -111,6 +112,7 @@ CurriculumConfig = Annotated[
     | ProximalConfig
     | LearningProgressConfig
     | TransportConfig
+    | EdgeConfig
     | ReplayConfig
     | WatchedConfig
     | CustomConfig,
