@@ -503,6 +503,8 @@ def test_time_left_is_told_by_the_rate_of_what_was_seen(tmp_path: Path, monkeypa
     now[0] += 60.0
     assert left.in_words(Overview(4, 3000, done=1)) == ", 3,000 steps left, about 0:03:00"
     run = Run(Cell("0" * 12, "cell", {}, {}), 0)
+    begun = overview._TimeLeft(Grid(tmp_path))
+    assert begun.in_words(Overview(1, 4000, running=[run])) == ", 4,000 steps left, starting"
     ledger = Grid(tmp_path).ledger(run)
     ledger.folder.mkdir(parents=True)
     (ledger.folder / METRICS).write_bytes(encode_row({"kind": "iteration", "steps": 500}) + b'{"kind":"iterat')
