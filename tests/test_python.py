@@ -74,7 +74,7 @@ def test_a_longer_run_is_the_one_that_had_its_budget_from_the_start(
     long = config_for(tmp_path, section, checkpoint={"every_rounds": 2}, budget={"steps": 11 * N_STEPS})
     space_dist.train(short, out=tmp_path / "run", progress=False)
     assert space_dist.Run(tmp_path / "run").status.steps == short.budget.steps
-    with pytest.raises(ConfigError, match="--resume continues it"):
+    with pytest.raises(ConfigError, match=r"--resume continues it, .*from Python: resume=True"):
         space_dist.train(long, out=tmp_path / "run", progress=False)
     space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "whole", progress=False)
