@@ -63,13 +63,13 @@ class _TimeLeft:
     def __init__(self, place: Grid) -> None:
         self._place = place
         self._first: tuple[float, int] | None = None  # when we looked first, and the steps that were left then
-        self._looked, self._words = 0.0, ""
+        self._looked, self._done, self._words = 0.0, 0, ""
 
     def in_words(self, overview: Overview) -> str:
         """`, 614,400 steps left, about 0:12:00`; the time as soon as it can be told."""
         now = time.monotonic()
-        if now - self._looked >= _COUNT_SECONDS or not overview.steps_left:
-            self._looked, self._words = now, self._estimated(overview, now)
+        if now - self._looked >= _COUNT_SECONDS or overview.done != self._done or not overview.steps_left:
+            self._looked, self._done, self._words = now, overview.done, self._estimated(overview, now)
         return self._words
 
     def _estimated(self, overview: Overview, now: float) -> str:
