@@ -12,6 +12,7 @@ from space_dist.config import (
     ContextSpaceConfig,
     CurriculumConfig,
     CustomConfig,
+    EdgeConfig,
     FixedConfig,
     LearnabilityConfig,
     LearningProgressConfig,
@@ -31,6 +32,7 @@ from space_dist.config import (
 from space_dist.curricula import variants
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
+from space_dist.curricula.edge import Edge
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
 from space_dist.curricula.learning_progress import LearningProgress
@@ -85,6 +87,7 @@ class Makers:
             ProximalConfig: self._proximal,
             LearningProgressConfig: self._learning_progress,
             TransportConfig: self._transport,
+            EdgeConfig: self._edge,
             ReplayConfig: self._replay,
             WatchedConfig: self._watched,
             CustomConfig: self._custom,
@@ -189,6 +192,13 @@ class Makers:
             self._train, seed=self._seed, draws=self._draws, outcome=settings.outcome, lowest=settings.lowest_return,
             largest=settings.largest_return, smoothing=settings.smoothing, theta=settings.theta,
             uniform_share=settings.uniform_share,
+        )  # fmt: skip
+
+    def _edge(self, settings: EdgeConfig) -> Edge:
+        return Edge(
+            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, outcome=settings.outcome,
+            lowest=settings.lowest_return, largest=settings.largest_return, memory=settings.memory,
+            width=settings.width, strength=settings.strength, uniform_share=settings.uniform_share,
         )  # fmt: skip
 
     def _transport(self, settings: TransportConfig) -> Transport:
