@@ -32,7 +32,7 @@ check: $(STAMP)
 
 # One artefact of the paper, run and kept in docs/results: make results NAME=pointmass_uniform; in small: SCALE=0.02.
 results: $(STAMP)
-	$(BIN)/python jobs/results.py $(NAME) --scale $(or $(SCALE),1.0)
+	$(BIN)/python jobs/results.py $(or $(NAME),$(error which grid? make results NAME=pointmass_uniform)) --scale $(or $(SCALE),1.0)
 
 # The documentation as a site, in site/: open site/index.html. Warnings are errors.
 docs: $(STAMP)

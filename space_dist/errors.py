@@ -45,8 +45,10 @@ def exits_refused() -> Iterator[None]:
 
 
 def nearest(word: str, allowed: Iterable[str]) -> str:
-    """`"; did you mean 'eta'?"` where one of `allowed` resembles `word`, else `"."`: the end of a clause."""
-    close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.5)
+    """`"; did you mean 'eta'?"`, of what in `allowed` begins with or resembles `word`; else `"."`: a clause's end."""
+    names = list(allowed)
+    close = [name for name in names if word and name.startswith(f"{word}_")]  # cpus: cpus_per_task rather than gpus
+    close = close or difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else "."
 
 

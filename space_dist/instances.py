@@ -163,12 +163,15 @@ class InstanceSet:
     def subset(self, indices: NDArray[np.int64] | Sequence[int]) -> InstanceSet:
         """The instances at `(k,)` distinct positions (not ids, not a mask).
 
-        Raises ConfigError if a position is doubled or no whole number, or none is given; IndexError if it does not
-        exist.
+        Raises ConfigError if a position is doubled, no whole number or not there, or none is given.
         """
         chosen = np.asarray(indices)
         if not np.issubdtype(chosen.dtype, np.integer):
             raise ConfigError(f"a subset is chosen by at least one position, a whole number, not by {chosen.dtype}")
+        if absent := [index for index in chosen.tolist() if not -len(self) <= index < len(self)]:
+            raise ConfigError(
+                f"a subset is chosen by positions, here 0 to {len(self) - 1} (not by ids), not by {absent[0]}"
+            )
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names, columns)
 

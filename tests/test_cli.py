@@ -503,10 +503,15 @@ def test_time_left_is_told_by_the_rate_of_what_was_seen(tmp_path: Path, monkeypa
     now[0] += 60.0
     assert left.in_words(Overview(4, 3000, done=1)) == ", 3,000 steps left, about 0:03:00"
     run = Run(Cell("0" * 12, "cell", {}, {}), 0)
+    begun = overview._TimeLeft(Grid(tmp_path))
+    assert begun.in_words(Overview(1, 4000, running=[run])) == ", 4,000 steps left, starting"
     ledger = Grid(tmp_path).ledger(run)
     ledger.folder.mkdir(parents=True)
     (ledger.folder / METRICS).write_bytes(encode_row({"kind": "iteration", "steps": 500}) + b'{"kind":"iterat')
     now[0] += 60.0  # what runs counts by its rows, of which the last is half written
     assert left.in_words(Overview(4, 3000, done=1, running=[run])) == ", 2,500 steps left, about 0:03:20"
+    now[0] += 1.0  # too soon to count anew, but that another one is done
+    assert left.in_words(Overview(4, 3000, done=1)) == ", 2,500 steps left, about 0:03:20"
+    assert left.in_words(Overview(4, 2000, done=2)) == ", 2,000 steps left, about 0:02:01"
     now[0] += 60.0
     assert left.in_words(Overview(4, 0, done=4)) == ""

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist.cli.overview import print_failures
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, find_grid
@@ -363,3 +364,18 @@ def test_last_lines_of_anything(tmp_path: Path) -> None:
     assert last_lines(path) == []
     path.write_bytes(b"a\n\n" * 100_000 + b"\xff\nlast\n")
     assert last_lines(path, 2) == ["\ufffd", "last"]
+
+
+def test_a_stopped_run_lacks_no_explanation(
+    one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid, manifest, run = one
+    attempts = Attempts(grid.ledger(run))
+    said = {}
+    for number, cause in enumerate((Cause.STOPPED, Cause.KILLED), 1):
+        attempts.begin(number, {})
+        attempts.end(number, Ended(cause))
+        print_failures(run_statuses(grid, manifest, CODE), by_cause=False)
+        said[cause] = capsys.readouterr().out
+    assert said[Cause.STOPPED].rstrip().endswith("waiting: stopped")
+    assert said[Cause.KILLED].rstrip().endswith("failed: killed by an unknown hand; no more is known")

@@ -433,11 +433,15 @@ def test_subset() -> None:
     chosen = instances.subset(np.array([2, 0]))
     assert chosen.ids.tolist() == [1, 5]
     assert chosen.contexts.tolist() == [[10], [50]]
-    for positions, said in (([0, 0], "the id 1"), ([], "at least one"), ([True, False, True], "bool")):
+    for positions, said in (
+        ([0, 0], "the id 1"),
+        ([], "at least one"),
+        ([True, False, True], "bool"),
+        ([3], r"0 to 2 \(not by ids\), not by 3"),
+        ([0, -4], "not by -4"),
+    ):
         with pytest.raises(ConfigError, match=said):
             instances.subset(positions)
-    with pytest.raises(IndexError):
-        instances.subset([3])
 
 
 def test_summary() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -74,7 +75,7 @@ def test_a_longer_run_is_the_one_that_had_its_budget_from_the_start(
     long = config_for(tmp_path, section, checkpoint={"every_rounds": 2}, budget={"steps": 11 * N_STEPS})
     space_dist.train(short, out=tmp_path / "run", progress=False)
     assert space_dist.Run(tmp_path / "run").status.steps == short.budget.steps
-    with pytest.raises(ConfigError, match="--resume continues it"):
+    with pytest.raises(ConfigError, match=r"--resume continues it, .*from Python: resume=True"):
         space_dist.train(long, out=tmp_path / "run", progress=False)
     space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "whole", progress=False)
@@ -334,3 +335,11 @@ def test_names_are_there_and_nothing_is_imported_before_one_is_asked_for() -> No
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=PATIENCE, env=environment
     )  # fmt: skip
     assert done.stdout.strip() == "['space_dist']", done.stderr
+
+
+def test_a_rate_that_cannot_be_told_yet_is_a_dash() -> None:
+    known = Progress(2048, 4096, 5012.3, 4, 100)
+    assert "  5,012/s  set 4/100" in progress.line_of_run("pointmass_space", 0, known)
+    assert "  —/s  set 4/100" in progress.line_of_run(
+        "pointmass_space", 0, dataclasses.replace(known, steps_per_second=0.0)
+    )

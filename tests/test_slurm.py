@@ -189,6 +189,11 @@ def test_the_commented_profile_names_every_field() -> None:
         (["env={POSIXLY_CORRECT: '1'}"], ["POSIXLY_CORRECT is bash's own"]),
         (["env={PATH: /opt/bin}"], ["PATH", "prologue", "export PATH=/opt/bin:$PATH"]),
         (["temp=relative"], ["temp", "relative"]),
+        (["venv=.venv"], ["venv", "must be a path from / on", "nothing in it is expanded"]),
+        (["venv=~/.venv"], ["venv", "must be a path from / on"]),
+        (["conda=~/envs/mine"], ["conda", "must not begin with ~"]),
+        (["apptainer=~/space_dist.sif"], ["apptainer", "must not begin with ~"]),
+        (["cpus=4"], ["cpus", "did you mean 'cpus_per_task'?"]),
         (["job_name=../../x"], ["job_name", "../../x"]),
         (["throttle=0"], ["throttle", "0"]),
         (["signal.name=TERM"], ["signal.name", "TERM"]),
@@ -351,7 +356,8 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
     assert run("slurm", "submit", out)[0] == 0
     code, said = run("grid", "status", out)
     assert code == 3
-    assert "SLURM jobs: train 103; aggregate 104" in said
+    assert "SLURM jobs: train 103; aggregate 104; none in the queue now" in said
+    assert f"what the jobs said is in {out / 'logs'}" in " ".join(said.split())
     assert run("slurm", "submit", tmp_path)[0] == 2
     assert run("slurm", "export", out, "--out", tmp_path / "copy")[0] == 0
     code, said = run("slurm", "export", out, "--out", tmp_path / "copy", "--mode", "arry")
@@ -414,7 +420,7 @@ def _hostile_profile(value: str) -> tuple[dict[str, Any], list[str]]:
            "partition": value, "account": value, "qos": value, "constraint": value, "nodelist": value,
            "exclude": value, "reservation": value, "gres": value, "gpus": value, "dependency": value,
            "time": value, "mem": value, "mem_per_cpu": value, "job_name": value, "interface": value,
-           "temp": f"/{value}", "venv": value, "exclusive": value}  # fmt: skip
+           "temp": f"/{value}", "venv": f"/{value}", "exclusive": value}  # fmt: skip
     wrapped: dict[str, Any] = {
         "modules": [value], "apptainer_options": [value], "extra": [f"--licenses={value}"], "env": {"HOSTILE": value},
         "command": ["space-dist", value], "mail_type": [value], "signal": {"name": value},

@@ -194,6 +194,12 @@ def test_commands_tell_how_a_search_stands(
     assert "grid run" in said("confirm", path)
     assert "12 complete" in said("run", path)  # nothing is left to do
     assert "12 complete" in said(path)  # the same, in short
+    assert "12 complete" in said(root / "search")
+    assert "141" not in said("report", path)
+    confirming = plan(root / "search/confirm/search-confirm.yaml", root)
+    for run in confirming.manifest.runs():
+        end(confirming.grid, run, 40.0 + run.seed)
+    assert "141" in said("report", path)  # the mean of 140, 141 and 142, as in report.html
     assert command(monkeypatch, "grid", "run", root / "search") == 2
     assert "holds a search: space-dist tune run" in capsys.readouterr().err
     assert command(monkeypatch, "slurm", "export", root / "search", "--out", tmp_path / "out") == 2

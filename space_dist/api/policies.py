@@ -60,8 +60,9 @@ class ActingPolicy:
     def with_context(self, observation: Observations, context: NDArray[Any]) -> Observations:
         """`(..., obs), (..., d)` observations as the run's policy saw them: with the context, if it is shown one.
 
-        context: in environment units; it is scaled from its bounds to [-1, 1], and put behind flat observations, or
-        beside the parts of others. Raises ConfigError for a context of another length.
+        context: in environment units; it is scaled from its bounds to [-1, 1] (what lies beyond them: to the nearest of
+        them), and put behind flat observations, or beside the parts of others. Raises ConfigError for a context of
+        another length.
         """
         if not self.spec.context_visible:
             return observation

@@ -114,7 +114,8 @@ def instances_check(
             refuse_overlap(sets[other], one, str(files[other]), str(files[index]))
     for file, one in zip(files, sets, strict=True):
         padding = f", {_padding(one)}" if one.padding.any() else ""
-        table = Table(title=f"{file}: {len(one)} instances{padding}")
+        say(f"{file}: {len(one)} instances{padding}")
+        table = Table()
         for name in ("feature", "least", "mean", "greatest", "bounds"):
             table.add_column(name, justify="left" if name == "feature" else "right")
         for row, low, high in zip(summary(one, bounds), bounds.low, bounds.high, strict=True):

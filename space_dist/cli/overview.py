@@ -15,6 +15,7 @@ from rich.text import Text
 
 from space_dist.cli.terminal import console, say
 from space_dist.errors import SpaceDistError
+from space_dist.experiment.endings import Cause
 
 if TYPE_CHECKING:
     from space_dist.experiment.manifest import Cell, Grid, Manifest
@@ -62,22 +63,25 @@ class _TimeLeft:
     def __init__(self, place: Grid) -> None:
         self._place = place
         self._first: tuple[float, int] | None = None  # when we looked first, and the steps that were left then
-        self._looked, self._words = 0.0, ""
+        self._looked, self._done, self._words = 0.0, 0, ""
 
     def in_words(self, overview: Overview) -> str:
         """`, 614,400 steps left, about 0:12:00`; the time as soon as it can be told."""
         now = time.monotonic()
-        if now - self._looked >= _COUNT_SECONDS or not overview.steps_left:
-            self._looked, self._words = now, self._estimated(overview, now)
+        if now - self._looked >= _COUNT_SECONDS or overview.done != self._done or not overview.steps_left:
+            self._looked, self._done, self._words = now, overview.done, self._estimated(overview, now)
         return self._words
 
     def _estimated(self, overview: Overview, now: float) -> str:
-        left = max(0, overview.steps_left - sum(_steps_of(self._place.ledger(run)) for run in overview.running))
+        taken = sum(_steps_of(self._place.ledger(run)) for run in overview.running)
+        left = max(0, overview.steps_left - taken)
         if self._first is None:
             self._first = now, left
         seconds, done = now - self._first[0], self._first[1] - left
         if not left:
             return ""
+        if overview.running and not taken and done <= 0:
+            return f", {left:,} steps left, starting"
         about = f", about {datetime.timedelta(seconds=round(left * seconds / done))}" if done > 0 else ""
         return f", {left:,} steps left{about}"
 
@@ -165,17 +169,20 @@ def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
             for run_status in unwell:
                 if run_status.cause is cause:
                     run = run_status.run
-                    say(f"  {run.title} ({run.cell.id}): {run_status.condition}; {_last(run_status)}")
+                    say(f"  {run.title} ({run.cell.id}): {run_status.condition}{_why(run_status)}")
         return
     for run_status in unwell[:_SHOWN_RUNS]:
-        say(f"{run_status.run.title}: {run_status.in_words}; {_last(run_status)}")
+        say(f"{run_status.run.title}: {run_status.in_words}{_why(run_status)}")
     if len(unwell) > _SHOWN_RUNS:
         say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
 
 
-def _last(run_status: RunStatus) -> str:
+def _why(run_status: RunStatus) -> str:
+    """What is known beside the cause. Who stops a run knows why: nothing is missing there."""
     lines = run_status.detail.splitlines()
-    return lines[0][:300] if lines else "no more is known"
+    if lines:
+        return f"; {lines[0][:300]}"
+    return "" if run_status.cause is Cause.STOPPED else "; no more is known"
 
 
 def summary(manifest: Manifest, found: Sequence[RunStatus]) -> str:
@@ -190,7 +197,9 @@ def summary(manifest: Manifest, found: Sequence[RunStatus]) -> str:
 def workers_in_words(place: Grid, queue: Queue | None) -> str:
     """Who works on the grid: what Slurm says of its jobs, or whether anybody does."""
     if queue is not None:
-        return f"\n{queue.in_words()}"
+        logs = place.folder / "logs"
+        over = queue.answered and not queue.live and logs.is_dir()
+        return f"\n{queue.in_words()}" + (f"; what the jobs said is in {logs}" if over else "")
     return "" if place.owner_alive() else "; nobody is working on it now"
 
 

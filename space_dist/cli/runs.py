@@ -361,7 +361,7 @@ def _in_words(progress: Progress) -> str:
         return "—" if value is None else f"{value:.2f}"
 
     return (
-        f"{progress.steps:,}/{progress.budget_steps:,} steps  {progress.steps_per_second:,.0f}/s  "
+        f"{progress.steps:,}/{progress.budget_steps:,} steps  {progress.pace}  "
         f"set {progress.set_size}/{progress.n_instances}  "
         f"return train {number(progress.train_return)} test {number(progress.test_return)}"
     )

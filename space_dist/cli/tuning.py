@@ -42,12 +42,13 @@ _FAILED, _UNFINISHED = 1, 3  # exit codes of `tune status`
 
 
 class _RunsFiles(TyperGroup):
-    """`space-dist tune FILE.yaml` is `space-dist tune run FILE.yaml`."""
+    """`space-dist tune TUNE`, a file or a search's folder, is `space-dist tune run TUNE`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Of the words behind `tune`, the first of which names a command, or a file."""
-        if args and args[0] not in self.commands and (args[0].endswith(_FILES) or args[0].startswith("shipped:")):
-            args = ["run", *args]
+        """Of the words behind `tune`, the first of which names a command, a file or a folder."""
+        if args and args[0] not in self.commands:
+            named = args[0].endswith(_FILES) or args[0].startswith("shipped:") or Path(args[0]).is_dir()
+            args = ["run", *args] if named else args
         return super().resolve_command(ctx, args)
 
 
@@ -162,6 +163,7 @@ def tune_report(
     ] = None,
 ) -> None:
     """The search, the importance of its settings, and apart from it what was confirmed."""
+    from space_dist.cli.runs import print_grid_report
     from space_dist.experiment.tuning import find_tune
 
     with needed_from("tune", "the report of a search"):
@@ -169,9 +171,14 @@ def tune_report(
 
     place = find_tune(tune, root_of(root))
     made = build_search_report(place, out)
-    for line in made.summary:
-        say(line)
-    say(f"{made.folder / 'report.html'}")
+    how_far, of_confirmation = made.summary
+    say(how_far)
+    if made.confirmation is None:
+        say(of_confirmation)
+    else:
+        say("Confirmed with fresh seeds on the final instances:")
+        print_grid_report(made.confirmation, console)
+    say(f"Report of the search: {made.folder / 'report.html'}")
 
 
 @tune_app.command("confirm")

@@ -25,7 +25,7 @@ from space_dist.experiment.status import run_statuses
 from space_dist.experiment.tuning import confirmation_of
 from space_dist.report.document import Document, Picture, Section, to_html, to_markdown, writing_to
 from space_dist.report.figures import COLOURS, dress, empty_figure, plain, png, style_of
-from space_dist.report.grid_report import build_grid_report
+from space_dist.report.grid_report import GridReport, build_grid_report
 from space_dist.report.objective import IN_WORDS
 from space_dist.report.tables import NONE, Value, to_csv
 from space_dist.system.files import atomic_write
@@ -54,12 +54,14 @@ them.""".split("\n\n")
 class SearchReport:
     """What `build_search_report` wrote into `folder`: report.md, report.html, trials.csv, and PNG figures.
 
-    `summary` are sentences: how far the search is, and whether its choices are confirmed.
+    `summary` are sentences: how far the search is, and whether its choices are confirmed. `confirmation` is the report
+    of the grid that confirms them, if there is one.
     """
 
     folder: Path
     summary: list[str]
     markdown: str
+    confirmation: GridReport | None = None
 
 
 def build_search_report(grid: Grid, out: Path | None = None) -> SearchReport:
@@ -75,7 +77,7 @@ def build_search_report(grid: Grid, out: Path | None = None) -> SearchReport:
     folder = grid.folder / "report" if out is None else out
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    confirmed, of_confirmation = _confirmation(grid, manifest, search, folder)
+    confirmed, confirmation, of_confirmation = _confirmation(grid, manifest, search, folder)
     shares = {arm: importance(search, arm) for arm in search.arms}
     summary = [_how_far(search), of_confirmation]
     document = Document(
@@ -99,7 +101,7 @@ def build_search_report(grid: Grid, out: Path | None = None) -> SearchReport:
     with writing_to(folder):
         for name, content in files.items():
             atomic_write(folder / name, content)
-    return SearchReport(folder, summary, markdown)
+    return SearchReport(folder, summary, markdown, confirmation)
 
 
 # ---- the search ------------------------------------------------------------------------------------------------------
@@ -264,7 +266,9 @@ def _plain(value: Any) -> Value:
 # ---- the confirmation ------------------------------------------------------------------------------------------------
 
 
-def _confirmation(grid: Grid, manifest: Manifest, search: Search, out: Path) -> tuple[list[Section], str]:
+def _confirmation(
+    grid: Grid, manifest: Manifest, search: Search, out: Path
+) -> tuple[list[Section], GridReport | None, str]:
     """What the confirming grid beside the search's reached, and a sentence on it; nothing where it is not of this one.
 
     Its own report is written below `out`.
@@ -272,13 +276,13 @@ def _confirmation(grid: Grid, manifest: Manifest, search: Search, out: Path) -> 
     confirming = Grid(grid.folder.parent / confirmation_of(manifest.name))
     none = "Its choices are not confirmed yet, so there is no number to report"
     if not confirming.manifest_file.exists():
-        return [], f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it."
+        return [], None, f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it."
     try:
         found = confirming.manifest()
     except LedgerError as error:
-        return [], f"{none}: {error}."
+        return [], None, f"{none}: {error}."
     if fault := _not_of_this(found, manifest, search):
-        return [], f"{none}: {confirming.folder} {fault}; `space-dist tune confirm {grid.folder}` writes it anew."
+        return [], None, f"{none}: {confirming.folder} {fault}; `space-dist tune confirm {grid.folder}` writes it anew."
     made = build_grid_report(confirming, out / "confirmation", in_depth=False)
     curves = made.folder / "curves.png"
     pictures = [
@@ -291,7 +295,7 @@ def _confirmation(grid: Grid, manifest: Manifest, search: Search, out: Path) -> 
         *made.summary,
     ]
     done = made.summary[0]
-    return [Section("Confirmation", text, made.table, made.remarks, pictures)], f"Confirmation: {done}"
+    return [Section("Confirmation", text, made.table, made.remarks, pictures)], made, f"Confirmation: {done}"
 
 
 def _not_of_this(found: Manifest, manifest: Manifest, search: Search) -> str:

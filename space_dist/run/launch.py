@@ -200,7 +200,10 @@ def _begun(
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
     if ledger.exists() and not resume:
-        raise ConfigError(f"{folder} already holds a run: --resume continues it, --out DIR starts another")
+        raise ConfigError(
+            f"{folder} already holds a run: --resume continues it, --out DIR starts another (from Python: resume=True, "
+            "out=DIR)"
+        )
     with RunWriter(ledger) as writer:
         status = _claim(blueprint, setup, writer, pause_at)
         done = Outcome(ledger, already_done=status.has_reached(pause_at))

@@ -77,6 +77,11 @@ class Progress:
     train_return: float | None = None
     test_return: float | None = None
 
+    @property
+    def pace(self) -> str:
+        """`5,012/s`, or a dash until it can be told."""
+        return f"{self.steps_per_second:,.0f}/s" if self.steps_per_second > 0 else "—/s"
+
 
 @dataclass
 class _InFlight:

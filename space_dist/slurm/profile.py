@@ -55,6 +55,21 @@ def _no_option(value: str) -> str:
     return _one_line(value)
 
 
+def _unexpanded(value: str) -> str:
+    """Quoted, a tilde is a letter."""
+    if value.startswith("~"):
+        raise ValueError("it must not begin with ~, since nothing in it is expanded: write the path from / on")
+    return value
+
+
+def _whole_path(value: str) -> str:
+    if not value.startswith("/"):
+        raise ValueError(
+            "it must be a path from / on: jobs run in a folder of their own, and nothing in it is expanded"
+        )
+    return value
+
+
 Word = Annotated[str, Field(min_length=1, max_length=_MAX_WORD), AfterValidator(_no_option)]
 Text = Annotated[str, Field(min_length=1, max_length=_MAX_LINE), AfterValidator(_no_option)]
 Line = Annotated[str, Field(min_length=1, max_length=_MAX_LINE), AfterValidator(_one_line)]
@@ -157,11 +172,11 @@ class Profile(Section):
     """Environment variables, set to exactly these texts: nothing in them is expanded."""
     modules: tuple[Word, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
     """Modules to load."""
-    venv: Text | None = None
+    venv: Annotated[Text, AfterValidator(_whole_path)] | None = None
     """Folder of a Python virtual environment to activate."""
-    conda: Text | None = None
+    conda: Annotated[Text, AfterValidator(_unexpanded)] | None = None
     """Name or folder of a conda environment to activate."""
-    apptainer: Text | None = None
+    apptainer: Annotated[Text, AfterValidator(_unexpanded)] | None = None
     """Container image to run everything in. It must see the grid's folder and `temp`."""
     apptainer_options: tuple[Line, ...] = Field(default=(), max_length=_MAX_ITEMS, strict=False)
     """Options of `apptainer exec`, a word each: [--bind, /scratch]."""
