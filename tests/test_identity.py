@@ -219,7 +219,7 @@ def test_learners_say_what_they_can_do() -> None:
     found = {ability: configs.learners_that(ability) for ability in
              ("has_advantages", "keeps_next_observations", "can_be_stacked")}  # fmt: skip
     assert found == {
-        "has_advantages": ["ppo", "trpo", "a2c"],
+        "has_advantages": ["ppo", "trpo", "a2c", "recurrent_ppo"],
         "keeps_next_observations": ["dqn", "sac", "td3"],
         "can_be_stacked": ["ppo", "trpo"],
     }
