@@ -219,8 +219,17 @@ def test_another_seed_is_another_run(kind: str, references: Any, tmp_path: Path)
 @pytest.mark.usefixtures("one_ray")
 @pytest.mark.parametrize(  # on-policy learners and off-policy ones meet every number; starting an actor takes seconds
     ("kind", "workers"),
-    [("ppo", 1), ("ppo", 4), ("a2c", 2), ("trpo", 1), ("recurrent_ppo", 1), ("recurrent_ppo", 4), ("dqn", 2),
-     ("sac", 4), ("td3", 1)],
+    [
+        ("ppo", 1),
+        ("ppo", 4),
+        ("a2c", 2),
+        ("trpo", 1),
+        ("recurrent_ppo", 1),
+        ("recurrent_ppo", 4),
+        ("dqn", 2),
+        ("sac", 4),
+        ("td3", 1),
+    ],
 )
 def test_the_number_of_workers_changes_no_byte(kind: str, workers: int, references: Any, tmp_path: Path) -> None:
     config, _, expected = references[kind]

@@ -66,8 +66,8 @@ class ActingPolicy:
         if memory.values is not None and state is not None:
             if np.shape(state) != memory.values.shape:
                 raise ConfigError(
-                    f"the state of {count} observations has the shape {memory.values.shape}, not {np.shape(state)}; hand "
-                    "on what predict gave, or None where all episodes begin"
+                    f"the state of {count} observations has the shape {memory.values.shape}, not {np.shape(state)}; "
+                    "hand on what predict gave, or None where all episodes begin"
                 )
             memory.values[:] = state
             if episode_start is not None:
