@@ -20,7 +20,7 @@ from space_dist.envs import BatchedEnv, make_batched
 from space_dist.errors import ConfigError
 from space_dist.learner import make_learner
 from space_dist.learner.recurrent import RecurrentTorchPolicy, _torchs_own_lstm
-from space_dist.ledger import Ledger
+from space_dist.ledger import METRICS, Ledger
 from space_dist.rollout import Outcomes, Rollout, Shard, Stage, Trial, collect, evaluate
 from space_dist.rollout.memory import Memory
 from space_dist.rollout.walk import Walk
@@ -28,7 +28,7 @@ from space_dist.run.building import Blueprint
 from space_dist.run.launch import policy_of
 from space_dist.seeding import Purpose, generator, global_generators
 from tests.test_learner import Ignore
-from tests.test_learners import config_for, learner_section, run
+from tests.test_learners import config_for, crashed, interrupted, learner_section, run, with_checkpoints
 from tests.test_walk import LINE, POINTMASS, Noted, Played
 
 GLIMPSED = "tests.tiny_env:make_glimpsed"
@@ -283,7 +283,6 @@ def test_what_was_seen_is_remembered_until_the_end(tmp_path: Path) -> None:
     """Who goes straight to a target that is shown once earns 7.2 of 8; who forgets it, 2 standing still."""
     remembering = learnt(tmp_path / "recurrent", kind="recurrent_ppo", lstm_hidden_size=16)
     forgetting = learnt(tmp_path / "forgetting", kind="ppo")
-    print(remembering, forgetting)
     assert remembering >= 6.0
     assert forgetting < 5.0
 
@@ -355,6 +354,27 @@ def test_a_policy_of_ones_own_remembers(tmp_path: Path) -> None:
 
 class Mine(MlpLstmPolicy):
     """sb3-contrib's, by another name."""
+
+
+@pytest.mark.parametrize("curriculum", [{"kind": "plr"}, {"kind": "vds", "n_batches": 2, "batch_size": 20}])
+def test_a_fork_is_the_run_until_they_part_and_resumes(curriculum: dict[str, Any], tmp_path: Path) -> None:
+    at = 100  # in the third round of six
+    plain = config_for(tmp_path, learner_section("recurrent_ppo"), curriculum=curriculum)
+    expected = run(plain, tmp_path / "plain")
+    same = config_for(tmp_path, learner_section("recurrent_ppo"), curriculum=curriculum, fork={"seed": 0, "steps": at})
+    assert run(same, tmp_path / "same") == expected
+    other = same.model_copy(update={"seed": 1})
+    found = run(other, tmp_path / "other")
+    assert found["model.npz"] != expected["model.npz"]
+    theirs, ours = (
+        [row for row in Ledger(tmp_path / name).rows(METRICS) if row["steps"] <= at] for name in ("plain", "other")
+    )
+    assert ours == theirs
+    seldom, folder = with_checkpoints(other, 20), tmp_path / "disturbed"
+    interrupted(seldom, folder, 2)  # before they part
+    crashed(seldom, folder, 2)  # behind that, back to where they did
+    interrupted(seldom, folder, 1)
+    assert run(other, folder) == found
 
 
 @pytest.mark.parametrize("changes", [{"engine": "population"}, {"engine": "auto"}])
