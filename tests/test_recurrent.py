@@ -264,7 +264,10 @@ def test_start_values_are_those_of_episodes_that_begin() -> None:
 
 
 def learnt(folder: Path, **learner: Any) -> float:
-    """Mean return on both instances, whose target is shown in an episode's first step alone."""
+    """Mean return on both instances, whose target is shown in an episode's first step alone.
+
+    Seeds 0 to 3: 6.3 to 7.0 of RecurrentPPO, 2.4 to 4.7 of PPO.
+    """
     steps = 12_288
     config = config_for(
         folder, {"n_steps": 512, "batch_size": 256, "n_epochs": 6, "learning_rate": 1e-2, "net_arch": [16],
