@@ -44,6 +44,7 @@ KINDS = {
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
     "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -1, smoothing: 0.5}",
+    "edge": "{kind: edge, outcome: return, lowest_return: -1}",
     "plr_max_mc": "{kind: plr, score: max_mc}",
     "plr_robust": "{kind: plr, robust: true, temperature: 1, within_update: fixed_chances}",
     "currot": "{kind: currot, delta: 0.5, particles: 12}",

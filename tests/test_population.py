@@ -93,6 +93,7 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
 DRAWING = (
     {"kind": "procurl", "score": "improvement", "scale": "set"},
     {"kind": "learning_progress", "smoothing": 0.5},
+    {"kind": "edge", "memory": 0.5},
     {"kind": "plr", "robust": True, "scored_share": 0.3, "temperature": 1.0},
     {"kind": "plr", "robust": True, "scored_share": 0.3, "score": "max_mc", "within_update": "fixed_chances"},
     {"kind": "currot", "delta": -1.0, "particles": 8, "over": "bounds"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,18 @@ def test_updates_are_those_of_sb3_contrib_to_the_bit(env_id: str, lstms: str) ->
         assert update.gradient_steps == 2 * 3  # minibatches of 16 of 42 transitions
         assert update.advantages is not None
         assert update.advantages.shape == (length, SHARDS * SLOTS)
+
+
+def test_rounds_without_a_reward_teach_the_critic_alone() -> None:
+    stages = [Stage(make_batched(LINE, SLOTS, context_visible=False)) for _ in range(SHARDS)]
+    learner = learner_for(stages[0].env, 7, unrewarded="critic")
+    shards = collected(learner, stages, some_contexts(stages[0].env), Walk(-1, ()), 0, 7)
+    before = {name: tensor.clone() for name, tensor in learner.model.policy.state_dict().items()}
+    none = [dataclasses.replace(shard, rewards=np.zeros_like(shard.rewards)) for shard in shards]
+    learner.update(none, round=0, steps=SHARDS * SLOTS * 7)
+    for name, now in learner.model.policy.state_dict().items():
+        critics = "critic" in name or "value_net" in name
+        assert torch.equal(now, before[name]) != critics, name
 
 
 # ---- memory ----

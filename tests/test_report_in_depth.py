@@ -225,7 +225,7 @@ EVERY = [
     "{kind: cspace, kappa: 2}", "{kind: fixed, count: 3}", "{kind: plr}", "{kind: alp_gmm, fit_rate: 12}",
     "{kind: alp_gmm, fit_rate: 12, over: bounds}", "{kind: vds}", "{kind: learnability, every: 1, episodes: 2, top: 2}",
     "{kind: spdrl, warm_up: 0, offset: 0}", "{kind: procurl, score: improvement}", "{kind: learning_progress}",
-    "{kind: plr, robust: true}", "{kind: currot, delta: 0}", "{kind: currot, delta: 0, over: bounds}",
+    "{kind: edge}", "{kind: plr, robust: true}", "{kind: currot, delta: 0}", "{kind: currot, delta: 0, over: bounds}",
 ]  # fmt: skip
 
 

@@ -34,6 +34,7 @@ KINDS = {
     "procurl": "{kind: procurl, score: improvement, scale: set}",
     "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -2, largest_return: 2}",
     "plr_robust": "{kind: plr, robust: true, score: max_mc, scored_share: 0.1, temperature: 1}",
+    "edge": "{kind: edge, outcome: return, lowest_return: -2, largest_return: 2}",
     "currot": "{kind: currot, delta: 1, particles: 20, over: bounds}",
 }
 GENERATING = ("spdrl", "alp_gmm", "currot")
@@ -115,7 +116,7 @@ def test_interrupted_after_every_round_and_resumed_it_is_the_same(
     ("kind", "workers"),
     [("spdrl", 1), ("spdrl", 4), ("uniform", 1), ("vds", 2), ("alp_gmm", 2), ("plr", 1), ("learnability", 2),
      ("manual", 2), ("procurl", 4), ("learning_progress", 1), ("learning_progress", 4), ("plr_robust", 1),
-     ("plr_robust", 4), ("currot", 1), ("currot", 4)],
+     ("plr_robust", 4), ("currot", 1), ("currot", 4), ("edge", 1), ("edge", 4)],
 )  # fmt: skip
 def test_the_number_of_workers_changes_no_byte(
     kind: str, workers: int, folder: Path, reference: Any, tmp_path: Path

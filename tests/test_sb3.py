@@ -198,7 +198,7 @@ CURRICULA: dict[str, dict[str, Any]] = {
     "cspace": {"eta": 0.4}, "round_robin": {}, "fixed": {"count": 2}, "random_growth": {"eta": 0.4}, "uniform": {},
     "spdrl": {"warm_up": 1, "offset": 2}, "alp_gmm": {"fit_rate": 10, "components": 3},
     "alp_gmm over bounds": {"fit_rate": 10, "components": 3, "over": "bounds"}, "plr": {},
-    "learnability": {"top": 2, "every": 2}, "learning_progress": {}, "plr max_mc": {"score": "max_mc"},
+    "learnability": {"top": 2, "every": 2}, "learning_progress": {}, "edge": {}, "plr max_mc": {"score": "max_mc"},
     "currot": {"delta": 0.0, "particles": 8}, "currot over bounds": {"delta": 0.0, "particles": 8, "over": "bounds"},
     "space with zero": {"eta": 0.4, "v0": "zero", "kappa": 2},
 }  # fmt: skip

@@ -99,8 +99,11 @@ def test_commands_take_a_scale_and_reports_say_it(
     where = ["--root", ran.parent / "runs", "--scale", "0.5"]
     assert command(monkeypatch, "grid", "plan", ran, *where) == 0
     assert command(monkeypatch, "grid", "run", ran, *where) == 0
-    assert command(monkeypatch, "grid", "status", ran, *where) == 0
+    monkeypatch.setenv("COLUMNS", "200")
     capsys.readouterr()
+    assert command(monkeypatch, "grid", "status", ran, *where) == 0
+    # Done is done: a budget of 384 steps has no room for a second update of 256. Two runs in each of two cells.
+    assert capsys.readouterr().out.count("100% of 512") == 2
     assert command(monkeypatch, "report", ran, *where) == 0
     words = "scale 0.5: 50 % of the whole grid's steps, 2 seeds"
     assert words in " ".join(capsys.readouterr().out.split())

@@ -20,6 +20,7 @@ from space_dist.config.curriculum import (
 )
 from space_dist.config.drawing import (
     AlpGmmConfig,
+    EdgeConfig,
     LearnabilityConfig,
     LearningProgressConfig,
     LevelReplayConfig,
@@ -96,6 +97,7 @@ __all__ = [
     "CurriculumConfig",
     "CustomConfig",
     "DQNConfig",
+    "EdgeConfig",
     "EnvConfig",
     "EvaluationConfig",
     "FixedConfig",

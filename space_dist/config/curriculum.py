@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 
 from space_dist.config.drawing import (
     AlpGmmConfig,
+    EdgeConfig,
     LearnabilityConfig,
     LearningProgressConfig,
     LevelReplayConfig,
@@ -109,6 +110,7 @@ CurriculumConfig = Annotated[
     | ProximalConfig
     | LearningProgressConfig
     | TransportConfig
+    | EdgeConfig
     | ReplayConfig
     | WatchedConfig
     | CustomConfig,

@@ -227,14 +227,7 @@ class ProximalConfig(CurriculumSection):
         return True
 
 
-class LearningProgressConfig(CurriculumSection):
-    """Bidirectional learning progress (Kanitscheider et al. 2021): instances whose success rate rises or falls.
-
-    No probes: rates are those of the training episodes.
-    """
-
-    kind: Literal["learning_progress"]
-    """Which curriculum: bidirectional learning progress."""
+class _OutcomeSection(CurriculumSection):
     outcome: Literal["success", "return"] = "success"
     """What an episode counts as. success: 1 or 0, as the environment says. return: its return, from 0 at lowest_return
     to 1 at largest_return, cut off at both ends. Source: Kanitscheider et al. 2021; ours."""
@@ -242,6 +235,24 @@ class LearningProgressConfig(CurriculumSection):
     """Of outcome: return: what counts as 0, in reward units."""
     largest_return: float = 1.0
     """Of outcome: return: what counts as 1, in reward units."""
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if self.lowest_return >= self.largest_return:
+            raise ValueError(
+                f"lowest_return: {self.lowest_return:g} must be below largest_return: {self.largest_return:g}"
+            )
+        return self
+
+
+class LearningProgressConfig(_OutcomeSection):
+    """Bidirectional learning progress (Kanitscheider et al. 2021): instances whose success rate rises or falls.
+
+    No probes: rates are those of the training episodes.
+    """
+
+    kind: Literal["learning_progress"]
+    """Which curriculum: bidirectional learning progress."""
     smoothing: float = Field(default=0.1, gt=0.0, le=1.0)
     """Weight of the new in both averages: the fast one is of rates, the slow one of the fast one. Source: OMNI's code
     (0.1)."""
@@ -252,13 +263,25 @@ class LearningProgressConfig(CurriculumSection):
     """Share of draws from all instances: what always failed is tried by these alone. Source: Syllabus, where rates are
     those of training episodes as well (0.25)."""
 
-    @model_validator(mode="after")
-    def _rising(self) -> Self:
-        if self.lowest_return >= self.largest_return:
-            raise ValueError(
-                f"lowest_return: {self.lowest_return:g} must be below largest_return: {self.largest_return:g}"
-            )
-        return self
+
+class EdgeConfig(_OutcomeSection):
+    """Instances in proportion to how uncertain the outcome of an episode is. Ours: docs/wins.md.
+
+    No probes: outcomes are those of training episodes, of their neighbours, and what the value function makes of them.
+    The numbers are the same for every world.
+    """
+
+    kind: Literal["edge"]
+    """Which curriculum: the edge of what the policy can do."""
+    memory: float = Field(default=0.9, ge=0.0, lt=1.0)
+    """Share of the remembered outcomes that an iteration leaves. Source: ours."""
+    width: float = Field(default=0.15, ge=0.0)
+    """How far outcomes speak for their neighbours: standard deviation of a normal kernel, in widths of the contexts'
+    bounds; 0: not at all. Source: ours."""
+    strength: float = Field(default=4.0, ge=0.0)
+    """Episodes that the value function's word counts as, beside those that were played; 0: it has none. Source: ours."""
+    uniform_share: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Share of draws from all instances. Source: ours."""
 
 
 class TransportConfig(CurriculumSection):

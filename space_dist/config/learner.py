@@ -132,6 +132,10 @@ class _Clipped(_OnPolicy):
     """Largest norm of the gradient; null: no clipping (the paper, appendix A). Source of the default: SB3."""
     target_kl: float | None = Field(default=None, gt=0.0)
     """Stop an update's epochs early at 1.5 times this divergence; null: never. Source: SB3."""
+    unrewarded: Literal["learn", "critic"] = "learn"
+    """What learns from a round in which every reward is 0. learn: the policy as well, as in SB3, though its advantages
+    are nothing but the errors of the value function, and normalised to size 1. critic: only the value function (and
+    the entropy bonus, if there is one), so that the policy does not drift before it has seen a reward. Source: ours."""
 
 
 class PPOConfig(_Clipped):

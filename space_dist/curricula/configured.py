@@ -14,6 +14,7 @@ from space_dist.config import (
     CustomConfig,
     FixedConfig,
     LearnabilityConfig,
+    EdgeConfig,
     LearningProgressConfig,
     LevelReplayConfig,
     ManualConfig,
@@ -33,6 +34,7 @@ from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
+from space_dist.curricula.edge import Edge
 from space_dist.curricula.learning_progress import LearningProgress
 from space_dist.curricula.plr import LevelReplay, Robust
 from space_dist.curricula.procurl import Proximal
@@ -85,6 +87,7 @@ class Makers:
             ProximalConfig: self._proximal,
             LearningProgressConfig: self._learning_progress,
             TransportConfig: self._transport,
+            EdgeConfig: self._edge,
             ReplayConfig: self._replay,
             WatchedConfig: self._watched,
             CustomConfig: self._custom,
@@ -189,6 +192,13 @@ class Makers:
             self._train, seed=self._seed, draws=self._draws, outcome=settings.outcome, lowest=settings.lowest_return,
             largest=settings.largest_return, smoothing=settings.smoothing, theta=settings.theta,
             uniform_share=settings.uniform_share,
+        )  # fmt: skip
+
+    def _edge(self, settings: EdgeConfig) -> Edge:
+        return Edge(
+            self._train, seed=self._seed, draws=self._draws, bounds=self._bounds, outcome=settings.outcome,
+            lowest=settings.lowest_return, largest=settings.largest_return, memory=settings.memory,
+            width=settings.width, strength=settings.strength, uniform_share=settings.uniform_share,
         )  # fmt: skip
 
     def _transport(self, settings: TransportConfig) -> Transport:

@@ -25,7 +25,7 @@ from space_dist.rollout.policy import Head, MlpPolicy, Statistics
 
 _OURS = {
     "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation",
-    "normalize_observations", "normalize_rewards", "update", "import_path", "kwargs",
+    "normalize_observations", "normalize_rewards", "unrewarded", "update", "import_path", "kwargs",
 }  # fmt: skip
 
 
@@ -58,6 +58,14 @@ class Joined:
             # As SB3's `train()` does: its buffer keeps numbers of actions as floats.
             actions = actions.long().flatten()
         return each(lambda array: array.reshape(count, *array.shape[2:]), self.observations), actions
+
+
+def leaves_policy(config: LearnerConfig, shards: Sequence[Shard]) -> bool:
+    """Whether a round shall teach the value function only: nothing in it was rewarded (`learner.unrewarded`).
+
+    Without advantages the policy's loss has no gradient; what the value function is fitted to stays.
+    """
+    return getattr(config, "unrewarded", "learn") == "critic" and not any(shard.rewards.any() for shard in shards)
 
 
 class OnPolicyLearner(SB3Learner):
@@ -133,6 +141,8 @@ class OnPolicyLearner(SB3Learner):
 
     def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
         self._advantages = self._sizes(shards)  # before `train` lays them out in its own way
+        if leaves_policy(self._settings, shards):
+            self.model.rollout_buffer.advantages[:] = 0.0
         self.model.num_timesteps = steps
         # SB3 does this in its own collecting, which never runs here.
         self.model._update_current_progress_remaining(steps, self._total_steps)

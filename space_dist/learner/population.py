@@ -25,7 +25,7 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.kernels import Shape
 from space_dist.learner.heads import evaluate
 from space_dist.learner.interface import NOT_A_NUMBER, Update, divergence, require_order
-from space_dist.learner.on_policy import Joined, OnPolicyLearner
+from space_dist.learner.on_policy import Joined, OnPolicyLearner, leaves_policy
 from space_dist.learner.stack import ACTOR, ROWS, Layout, Stack, rounded_up
 from space_dist.learner.stacked import PPO, PPOSettings, Report, Samples
 from space_dist.learner.trust_region import TRPO, TRPOSettings
@@ -358,7 +358,10 @@ def _evaluated(
     return collected, Samples(
         observations=seen[:, :count].contiguous(), actions=done[:, :count].contiguous(),
         log_probs=log_probs[:, :count].float().contiguous(),
-        advantages=together([one.advantages for one in collected]),
+        advantages=together([
+            np.zeros_like(one.advantages) if leaves_policy(learner.settings, one.shards) else one.advantages
+            for learner, one in zip(members, collected, strict=True)
+        ]),
         returns=together([one.returns for one in collected]),
     )  # fmt: skip
 

@@ -111,6 +111,11 @@ CASES: dict[str, tuple[str, list[str]]] = {
         *_LEAN, "budget.steps=512", "curriculum.outcome=return", "curriculum.lowest_return=0.25",
         "curriculum.largest_return=0.4",
     ]),
+    "edge": ("sparse_pointmass_edge", [
+        *_LEAN, "budget.steps=512", "curriculum.outcome=return", "learner.unrewarded=learn",
+        "env.id=space_dist/PointMass-v0", "curriculum.lowest_return=0.25", "curriculum.largest_return=0.4",
+    ]),
+    "edge of sparse rewards": ("sparse_pointmass_edge", [*_LEAN, "budget.steps=512"]),
     "currot": ("curricula/pointmass_currot", [
         *_LEAN, "budget.steps=512", "curriculum.delta=0.253", "curriculum.particles=16",
     ]),
