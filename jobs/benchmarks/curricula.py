@@ -44,6 +44,7 @@ KINDS = {
     "learnability": "{kind: learnability}",
     "procurl": "{kind: procurl}",
     "learning_progress": "{kind: learning_progress}",
+    "edge": "{kind: edge}",
     "currot over the set": "{kind: currot, delta: 4}",
     "currot over the bounds": "{kind: currot, delta: 4, over: bounds}",
     "alp_gmm": "{kind: alp_gmm}",

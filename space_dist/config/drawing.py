@@ -265,7 +265,7 @@ class LearningProgressConfig(_OutcomeSection):
 
 
 class EdgeConfig(_OutcomeSection):
-    """Instances in proportion to how uncertain the outcome of an episode is. Ours: docs/wins.md.
+    """Instances in proportion to how uncertain the outcome of an episode is. Ours: docs/curricula.md.
 
     No probes: outcomes are those of training episodes, of their neighbours, and what the value function makes of them.
     The numbers are the same for every world.
@@ -279,7 +279,7 @@ class EdgeConfig(_OutcomeSection):
     """How far outcomes speak for their neighbours: standard deviation of a normal kernel, in widths of the contexts'
     bounds; 0: not at all. Source: ours."""
     strength: float = Field(default=4.0, ge=0.0)
-    """Episodes that the value function's word counts as, beside those that were played; 0: it has none. Source: ours."""
+    """Episodes that the value function's word counts as, beside those played; 0: it has no say. Source: ours."""
     uniform_share: float = Field(default=0.1, ge=0.0, le=1.0)
     """Share of draws from all instances. Source: ours."""
 

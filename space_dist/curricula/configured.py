@@ -12,9 +12,9 @@ from space_dist.config import (
     ContextSpaceConfig,
     CurriculumConfig,
     CustomConfig,
+    EdgeConfig,
     FixedConfig,
     LearnabilityConfig,
-    EdgeConfig,
     LearningProgressConfig,
     LevelReplayConfig,
     ManualConfig,
@@ -32,9 +32,9 @@ from space_dist.config import (
 from space_dist.curricula import variants
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
+from space_dist.curricula.edge import Edge
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
-from space_dist.curricula.edge import Edge
 from space_dist.curricula.learning_progress import LearningProgress
 from space_dist.curricula.plr import LevelReplay, Robust
 from space_dist.curricula.procurl import Proximal
