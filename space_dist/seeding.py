@@ -43,6 +43,7 @@ class Purpose(enum.IntEnum):
     MEMBERS = 18
     CUSTOM = 19
     TRIALS = 20
+    GENERATION = 21
 
 
 def seed_sequence(seed: int, purpose: Purpose, *keys: int) -> np.random.SeedSequence:

@@ -344,6 +344,10 @@ class WantsAdvantages(Honest):
     wants = Wants(advantages=True)
 
 
+class WantsNegatives(Honest):
+    wants = Wants(episodes=True, advantages=True, advantage_part="postive")  # type: ignore[arg-type]
+
+
 class WantsSuccess(Honest):
     wants = Wants(success=True)
 

@@ -57,6 +57,38 @@ class Honest(gym.Env[Any, Any]):
         return picture
 
 
+class Edits(Honest):
+    """Honest, and its contexts can be edited."""
+
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:
+        return np.clip(contexts + 0.01 * edits * rng.random(contexts.shape), [0.1, -0.5], 0.5)
+
+
+class EditsUnseeded(Edits):
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:  # noqa: ARG002
+        return super().edit_contexts(np.random.default_rng(), contexts, edits)
+
+
+class EditsTooFar(Edits):
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:
+        return contexts + np.array([0.0, edits * rng.random()])
+
+
+class EditsToTheUnplayable(Edits):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        if options and options["context"][1] == 0.25:
+            raise KeyError("no such drift")
+        return super().reset(seed=seed, options=options)
+
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:  # noqa: ARG002
+        return np.column_stack((contexts[:, 0], np.full(len(contexts), 0.25)))
+
+
+class EditsNothing(Edits):
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:  # noqa: ARG002
+        return contexts
+
+
 class IgnoresContexts(Honest):
     def move(self, action: Any) -> float:
         return 0.3 * (action - 1)

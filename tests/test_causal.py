@@ -42,6 +42,7 @@ KINDS = {
     "edge": "{kind: edge, outcome: return, lowest_return: 0.25, largest_return: 0.5}",
     "plr_robust": "{kind: plr, robust: true, score: max_mc, scored_share: 0.3, temperature: 1}",
     "currot": "{kind: currot, delta: 0.3, particles: 16, over: bounds}",
+    "accel": "{kind: accel, buffer: 8, batch: 6, filled_share: 0.3}",
 }
 
 
@@ -314,7 +315,7 @@ def test_continuations_are_the_run_until_they_part(sets: Path, of: Any, tmp_path
     assert len(models) == 4
 
 
-@pytest.mark.parametrize("kind", ["procurl", "learning_progress", "plr_robust", "currot", "edge"])
+@pytest.mark.parametrize("kind", ["procurl", "learning_progress", "plr_robust", "currot", "edge", "accel"])
 def test_draws_are_gone_on_with_behind_a_fork(kind: str, sets: Path, of: Any, tmp_path: Path) -> None:
     trunk = of(kind)
     same = run(forked(sets, KINDS[kind], None, seed=0), tmp_path / "same")

@@ -48,6 +48,7 @@ FAULTS = {
     "ProbesOutside": "probes() asks for index 40; the set has indices 0 to 39",
     "WantsEnsemble": "it wants the values of an ensemble, which is trained for curriculum.kind: vds alone",
     "WantsAdvantages": "it wants advantages, which are told by episode, and no episodes",
+    "WantsNegatives": "has advantage_part 'postive'; did you mean 'positive'? Allowed: size, positive",
     "WantsSuccess": "it wants success, which is told by episode, and no episodes",
     "LearnsNot": "start() selects what shall not be learned from; say so before: set Wants(unlearned=True)",
     "WantsInWords": "its `wants` must be a space_dist.curricula.Wants, not a tuple",

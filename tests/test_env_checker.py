@@ -43,6 +43,9 @@ FAULTS = {
     "ChangesActions": "step() changes the action it is given",
     "NumberObserved": "its observation_space must be a Box or a Dict of Boxes, not Discrete(5)",
     "OnePartOnly": "the observation at reset has the parts place, its space has clock, place",
+    "EditsUnseeded": "edit_contexts() is not a function of its arguments",
+    "EditsTooFar": "edit_contexts gave a context with drift = .* not within [-0.5, 0.5]",
+    "EditsToTheUnplayable": "reset() with the context .* fails: KeyError: 'no such drift'",
     "NoContextSpace": "has no `context_space`",
     "EndlessBounds": "its context_space cannot be used: feature 'gain' has bounds [-inf, inf]",
     "NamesTwice": "the feature 'gain' is named twice",
@@ -84,13 +87,14 @@ def test_a_batched_environments_fault_is_named(kind: str) -> None:
     assert said(fault, BATCHED_FAULTS[kind]), fault
 
 
-@pytest.mark.parametrize("kind", ["Honest", "Whole", "Parts", "HalfUsed"])
+@pytest.mark.parametrize("kind", ["Honest", "Whole", "Parts", "HalfUsed", "Edits", "EditsNothing"])
 def test_without_fault(kind: str) -> None:
     findings = check(f"tests.faulty_env:{kind}")
     assert findings.faults == []
     assert findings.horizon == 12
     notes = [note for note in findings.notes if "'drift'" in note]
     assert len(notes) == (kind == "HalfUsed")
+    assert any("edit_contexts() changed nothing" in note for note in findings.notes) == (kind == "EditsNothing")
 
 
 @pytest.mark.parametrize("env_id", BATCHED)

@@ -44,12 +44,15 @@ KINDS = {
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
     "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -1, smoothing: 0.5}",
+    "plr_positive": "{kind: plr, score: positive_value_loss}",
     "edge": "{kind: edge, outcome: return, lowest_return: -1}",
     "plr_max_mc": "{kind: plr, score: max_mc}",
     "plr_robust": "{kind: plr, robust: true, temperature: 1, within_update: fixed_chances}",
     "currot": "{kind: currot, delta: 0.5, particles: 12}",
     "currot_bounds": "{kind: currot, delta: 0.5, particles: 12, over: bounds, target: normal, target_mean: [1, 0],"
     " target_std: [0.1, 1]}",
+    "accel": "{kind: accel, buffer: 6, batch: 4}",
+    "accel_set": "{kind: accel, buffer: 6, batch: 4, new_from: set, edited: batch, score: max_mc, robust: false}",
     "manual": "{kind: manual, column: effort}",
     "watched": "{kind: watched, iterations: 4, shares: 2}",
 }

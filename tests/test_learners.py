@@ -562,7 +562,7 @@ def test_old_rounds_are_valued_by_the_weights_that_acted(tmp_path: Path) -> None
     blueprint = Blueprint.of(config)
     setup = blueprint.setup(*blueprint.instances())
     learner, fresh = blueprint.learner(), blueprint.learner()
-    worker, selection = Worker(setup), blueprint.curriculum(setup.train).start()[1]
+    worker, selection = Worker(setup), blueprint.curriculum(setup.train, setup.test).start()[1]
     asked: dict[str, Any] = {"steps": 0, "selection_version": 0}
     first = [worker.collect(learner.policy(0), selection, Walk(-1, ()), round=0, shard=k, **asked) for k in range(4)]
     acted = learner.scored()

@@ -16,6 +16,7 @@ from space_dist import config as configs
 from space_dist.curricula import (
     Draws,
     Feedback,
+    Wants,
 )
 from space_dist.curricula.plr import LevelReplay, Robust, replay_chances, replayed
 from space_dist.errors import ConfigError
@@ -23,6 +24,7 @@ from space_dist.ledger import METRICS, VALUES, Ledger, decode_values
 from space_dist.rollout import Episodes as Table
 from space_dist.rollout.episodes import mean_sizes
 from space_dist.run.launch import launch
+from space_dist.run.training import Training
 from space_dist.seeding import Purpose, generator
 from space_dist.system.interrupts import StopRequests
 from tests.test_every_curriculum import set_up
@@ -187,12 +189,72 @@ def test_every_instance_is_begun_once_before_any_is_begun_again(
         assert len(together) > 90 or len(set(together)) == len(together)  # the shards do not begin equally many
 
 
-# ---- max_mc, and robust ----------------------------------------------------------------------------------------------
+# ---- positive_value_loss, max_mc, and robust -------------------------------------------------------------------------
 
 
 def plr(n: int = 6, **changes: Any) -> LevelReplay:
     settings: dict[str, Any] = {"temperature": 1.0, "staleness_share": 0.0, "within_update": "fixed_chances"}
     return LevelReplay(instances(n), seed=0, draws=Draws(12, 2), **{**settings, **changes})
+
+
+def test_what_counts_of_an_advantage_by_hand() -> None:
+    # One slot: an episode of 1, -4 and 3, and 2 steps of another, -2 and -1, which the next round ends with 5.
+    def shard(times: list[int], lengths: list[int], start: bool) -> Any:
+        slots, nothing = np.zeros(len(times), dtype=np.int64), np.zeros(0)
+        table = Table(slots, np.zeros((0, 1)), slots, np.array(times), np.array(lengths), *[nothing] * 3)
+        return SimpleNamespace(episodes=table, rewards=np.zeros((5, 1)), starts=np.array([start]))
+
+    first, second = np.array([[1.0, -4.0, 3.0, -2.0, -1.0]]).T, np.array([[5.0, -9.0, -9.0, -9.0, -9.0]]).T
+    for part, early, later in (("size", 8 / 3, 8 / 3), ("positive", 4 / 3, 5 / 3)):
+        wants = Wants(episodes=True, advantages=True, advantage_part=part)  # type: ignore[arg-type]
+        means, running = mean_sizes([shard([2], [3], True)], wants.counted(first), np.zeros(1))
+        assert means == pytest.approx([early])
+        means, _ = mean_sizes([shard([0], [3], False)], wants.counted(second), running)
+        assert means == pytest.approx([later])
+    for score, part in (("value_l1", "size"), ("positive_value_loss", "positive")):
+        wants = plr(score=score).wants
+        assert (wants.advantages, wants.advantage_part) == (True, part)
+
+
+def test_positive_value_loss_is_the_mean_of_what_an_episode_did_better_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Step by step, over episodes that go on from round to round."""
+    rounds, told, account, step = [], [], Training._account, LevelReplay.step
+
+    def accounted(self: Training, shards: Any, update: Any) -> None:
+        rounds.append((shards, update.advantages))
+        account(self, shards, update)
+
+    def stepped(self: LevelReplay, state: Any, feedback: Feedback) -> Any:
+        assert feedback.episodes is not None
+        told.extend(feedback.episodes.advantages.tolist())
+        return step(self, state, feedback)
+
+    monkeypatch.setattr(Training, "_account", accounted)
+    monkeypatch.setattr(LevelReplay, "step", stepped)
+    config = configs.load(SPACE, [
+        "curriculum={kind: plr, score: positive_value_loss}", "learner.n_steps=160", "learner.n_epochs=1",
+        "learner.net_arch=[8]", "rollout.slots=2", "rollout.shards=2", "budget.steps=1600", "env.kwargs.horizon=30",
+        "evaluation.every_steps=100000", "tracking.uri=null", "resources.workers=0",
+    ])  # fmt: skip
+    launch(config, tmp_path / "run", resume=False, stop=StopRequests())
+    expected, better = [], [[0.0, 0], [0.0, 0], [0.0, 0], [0.0, 0]]
+    for shards, advantages in rounds:
+        for number, shard in enumerate(shards):
+            ended = sorted(zip(shard.episodes.times.tolist(), shard.episodes.slots.tolist(), strict=True))
+            found = {}
+            for time, row in enumerate(advantages.tolist()):
+                for slot in range(2):
+                    book = better[2 * number + slot]
+                    book[0] += row[2 * number + slot] if row[2 * number + slot] > 0.0 else 0.0
+                    book[1] += 1
+                    if (time, slot) in ended:
+                        found[time, slot] = book[0] / book[1]
+                        book[:] = [0.0, 0]
+            expected.extend(found[one] for one in ended)
+    assert len(told) > 40
+    np.testing.assert_allclose(told, expected[: len(told)], rtol=1e-9)
 
 
 def told_returns(version: int, indices: list[int], returns: list[float], values: list[float]) -> Feedback:
@@ -357,14 +419,16 @@ def test_advantages_are_those_of_generalised_advantage_estimation() -> None:
         values = policy.values(shard.observations.reshape(-1, 2)).reshape(length, slots)  # type: ignore[union-attr]
         last, truncated = policy.values(shard.last_observations), policy.values(shard.truncated_observations)
         behind = {tuple(place): truncated[index] for index, place in enumerate(np.argwhere(shard.truncated))}
-        sizes, advantage = np.zeros((length, slots)), np.zeros(slots)
+        told, advantage = np.zeros((length, slots)), np.zeros(slots)
         for time in reversed(range(length)):
             for slot in range(slots):
                 following = last[slot] if time == length - 1 else values[time + 1, slot]
                 ended = (time, slot) in behind
                 delta = shard.rewards[time, slot] + 0.5 * behind.get((time, slot), following) - values[time, slot]
                 advantage[slot] = delta + (0.0 if ended else 0.5 * 0.5 * advantage[slot])
-                sizes[time, slot] = abs(advantage[slot])
-        expected.append(sizes)
+                told[time, slot] = advantage[slot]
+        expected.append(told)
     update = learner.update(shards, round=0, steps=128)
     np.testing.assert_allclose(update.advantages, np.concatenate(expected, axis=1), atol=1e-4)
+    assert update.advantages is not None
+    assert 0.0 < (update.advantages < 0.0).mean() < 1.0

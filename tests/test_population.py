@@ -97,6 +97,7 @@ DRAWING = (
     {"kind": "plr", "robust": True, "scored_share": 0.3, "temperature": 1.0},
     {"kind": "plr", "robust": True, "scored_share": 0.3, "score": "max_mc", "within_update": "fixed_chances"},
     {"kind": "currot", "delta": -1.0, "particles": 8, "over": "bounds"},
+    {"kind": "accel", "buffer": 8, "batch": 6, "filled_share": 0.3},
 )
 
 
@@ -109,7 +110,7 @@ def test_members_that_draw_are_what_their_runs_are_alone(kind: str, tmp_path: Pa
     folders = [tmp_path / f"run{number}" for number in range(len(DRAWING))]
     assert all(isinstance(end, Outcome) for end in together(configs, folders).values())
     assert [results(folder) for folder in folders] == expected
-    for folder in folders[2:4]:
+    for folder in (*folders[3:5], folders[6]):
         learned = {row["gradient_steps"] > 0 for row in Ledger(folder).rows() if row["kind"] == "iteration"}
         assert learned == {False, True}
 
@@ -266,7 +267,7 @@ def test_they_learn_each_for_itself_and_are_valued_together(tmp_path: Path) -> N
     own = [worker.start_values(member, 0) for member in policy.policies]
     assert np.array_equal(worker.start_values(policy, 0), np.mean(own, axis=0))
     assert not np.array_equal(own[0], own[1])
-    selection = blueprint.curriculum(setup.train).start()[1]
+    selection = blueprint.curriculum(setup.train, setup.test).start()[1]
     asked = {"round": 0, "steps": 0, "selection_version": 0}
     shards = [worker.collect(policy, selection, Walk(-1, ()), shard=number, **asked) for number in range(setup.shards)]
     single = Worker(dataclasses.replace(setup, policies=1))

@@ -226,6 +226,7 @@ EVERY = [
     "{kind: alp_gmm, fit_rate: 12, over: bounds}", "{kind: vds}", "{kind: learnability, every: 1, episodes: 2, top: 2}",
     "{kind: spdrl, warm_up: 0, offset: 0}", "{kind: procurl, score: improvement}", "{kind: learning_progress}",
     "{kind: edge}", "{kind: plr, robust: true}", "{kind: currot, delta: 0}", "{kind: currot, delta: 0, over: bounds}",
+    "{kind: accel, buffer: 8, batch: 6, filled_share: 0.3}",
 ]  # fmt: skip
 
 

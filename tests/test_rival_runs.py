@@ -36,8 +36,9 @@ KINDS = {
     "plr_robust": "{kind: plr, robust: true, score: max_mc, scored_share: 0.1, temperature: 1}",
     "edge": "{kind: edge, outcome: return, lowest_return: -2, largest_return: 2}",
     "currot": "{kind: currot, delta: 1, particles: 20, over: bounds}",
+    "accel": "{kind: accel, buffer: 6, batch: 4}",
 }
-GENERATING = ("spdrl", "alp_gmm", "currot")
+GENERATING = ("spdrl", "alp_gmm", "currot", "accel")
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +117,7 @@ def test_interrupted_after_every_round_and_resumed_it_is_the_same(
     ("kind", "workers"),
     [("spdrl", 1), ("spdrl", 4), ("uniform", 1), ("vds", 2), ("alp_gmm", 2), ("plr", 1), ("learnability", 2),
      ("manual", 2), ("procurl", 4), ("learning_progress", 1), ("learning_progress", 4), ("plr_robust", 1),
-     ("plr_robust", 4), ("currot", 1), ("currot", 4), ("edge", 1), ("edge", 4)],
+     ("plr_robust", 4), ("currot", 1), ("currot", 4), ("edge", 1), ("edge", 4), ("accel", 1), ("accel", 4)],
 )  # fmt: skip
 def test_the_number_of_workers_changes_no_byte(
     kind: str, workers: int, folder: Path, reference: Any, tmp_path: Path

@@ -38,7 +38,7 @@ from space_dist.rollout.policy import EnsemblePolicy, Statistics
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint
 from space_dist.seeding import Purpose, generator
-from tests.two_features import BOUNDS
+from tests.two_features import BOUNDS, Generator
 
 ROOT = Path(__file__).resolve().parent.parent
 SPACE = ROOT / "configs/pointmass_space.yaml"
@@ -481,7 +481,9 @@ def test_the_first_fit_comes_after_fit_rate_finished_episodes(from_set: bool) ->
 
 def made(curriculum: str, train: InstanceSet, seed: int = 0) -> Curriculum:
     settings = configs.load(SPACE, [f"curriculum={curriculum}"]).curriculum
-    return Makers(train, source="train.csv", seed=seed, draws=Draws(20, 2), bounds=BOUNDS).make(settings)
+    return Makers(train, source="train.csv", seed=seed, draws=Draws(20, 2), bounds=BOUNDS, generator=Generator).make(
+        settings
+    )
 
 
 def sets(curriculum: Curriculum, values: list[list[float]]) -> list[list[int]]:

@@ -201,6 +201,7 @@ CURRICULA: dict[str, dict[str, Any]] = {
     "alp_gmm over bounds": {"fit_rate": 10, "components": 3, "over": "bounds"}, "plr": {},
     "learnability": {"top": 2, "every": 2}, "learning_progress": {}, "edge": {}, "plr max_mc": {"score": "max_mc"},
     "currot": {"delta": 0.0, "particles": 8}, "currot over bounds": {"delta": 0.0, "particles": 8, "over": "bounds"},
+    "accel": {"buffer": 8, "batch": 4, "filled_share": 0.3, "robust": False, "score": "max_mc"},
     "space with zero": {"eta": 0.4, "v0": "zero", "kappa": 2},
 }  # fmt: skip
 

@@ -95,6 +95,11 @@ FACTS: dict[str, dict[str, Any]] = {
     "curricula/pointmass_currot": {
         **RIVALS, "curriculum.delta": 4.0, "curriculum.particles": 100, "curriculum.performance": "discounted_return",
     },
+    "curricula/mixed_maze_accel": {
+        "curriculum.replay_share": 0.8, "curriculum.filled_share": 0.5, "curriculum.edits": 5,
+        "curriculum.edited": "easiest", "curriculum.score": "positive_value_loss", "curriculum.temperature": 0.3,
+        "curriculum.staleness_share": 0.3, "curriculum.robust": True, "curriculum.batch": 32,
+    },
     "curricula/pointmass_learnability": {**RIVALS, "curriculum.uniform_share": 0.5},
     "curricula/pointmass_uniform": RIVALS,
     "pointmass_space": {**RIVALS, "curriculum.eta": 0.4, "curriculum.kappa": 16, "budget.steps": 1_000_000},

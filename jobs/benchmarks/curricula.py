@@ -47,6 +47,7 @@ KINDS = {
     "edge": "{kind: edge}",
     "currot over the set": "{kind: currot, delta: 4}",
     "currot over the bounds": "{kind: currot, delta: 4, over: bounds}",
+    "accel": "{kind: accel}",
     "alp_gmm": "{kind: alp_gmm}",
     "alp_gmm over the bounds": "{kind: alp_gmm, over: bounds}",
     "vds": "{kind: vds}",

@@ -19,6 +19,7 @@ from space_dist.config.curriculum import (
     WatchedConfig,
 )
 from space_dist.config.drawing import (
+    AccelConfig,
     AlpGmmConfig,
     EdgeConfig,
     LearnabilityConfig,
@@ -89,6 +90,7 @@ __all__ = [
     "NAME",
     "NOT_IDENTITY",
     "A2CConfig",
+    "AccelConfig",
     "AlpGmmConfig",
     "BudgetConfig",
     "Change",

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from space_dist.config.drawing import (
+    AccelConfig,
     AlpGmmConfig,
     EdgeConfig,
     LearnabilityConfig,
@@ -106,6 +107,7 @@ CurriculumConfig = Annotated[
     | ValueDisagreementConfig
     | AlpGmmConfig
     | LevelReplayConfig
+    | AccelConfig
     | LearnabilityConfig
     | ProximalConfig
     | LearningProgressConfig

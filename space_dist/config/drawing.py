@@ -160,10 +160,11 @@ class LevelReplayConfig(CurriculumSection):
     """How the episodes of one update are drawn, between which no score can change. without_repetition: what was drawn
     leaves the ranking until everything else was. fixed_chances: the paper's chances as they stand, by which one
     instance has nearly all episodes of an update. Source: ours; Jiang et al. 2021, who decide before each episode."""
-    score: Literal["value_l1", "max_mc"] = "value_l1"
-    """What instances are ranked by. value_l1: mean |GAE| of the episodes. max_mc: the highest discounted return that an
-    episode on it had so far, minus its start value. Source: Jiang et al. 2021; Jiang et al. 2021, "Replay-Guided
-    Adversarial Environment Design", whose value estimates are of all steps of an episode."""
+    score: Literal["value_l1", "positive_value_loss", "max_mc"] = "value_l1"
+    """What instances are ranked by. value_l1: mean |GAE| of the episodes. positive_value_loss: mean max(GAE, 0).
+    max_mc: the highest discounted return that an episode on it had so far, minus its start value. Source: Jiang et al.
+    2021; for the others Jiang et al. 2021, "Replay-Guided Adversarial Environment Design", whose max_mc is a mean over
+    all steps of an episode."""
     robust: bool = False
     """Learn from replayed instances only: rounds of uniform draws over the set are played and scored, charged to the
     budget, and not learned from. Source: the same (robust PLR)."""
@@ -172,6 +173,46 @@ class LevelReplayConfig(CurriculumSection):
     scored_share: float = Field(default=0.5, gt=0.0, le=1.0)
     """Of robust: the share of the set that must have been scored before anything is replayed. Source: the authors' code
     (0.5)."""
+
+
+class AccelConfig(CurriculumSection):
+    """ACCEL (Parker-Holder et al. 2022): contexts that are generated, replayed by an estimate of regret, and edited.
+
+    Needs an environment whose contexts can be edited (docs/curricula.md). On-policy learners; with score: max_mc and
+    robust: false, any.
+    """
+
+    kind: Literal["accel"]
+    """Which curriculum: ACCEL."""
+    new_from: Literal["generator", "set"] = "generator"
+    """What contexts are new. generator: those that the environment makes. set: the training instances, drawn uniformly.
+    Source: Parker-Holder et al. 2022; ours."""
+    buffer: int = Field(default=1000, ge=1, le=100_000)
+    """Contexts that are kept, at most. Source: the authors' code, BipedalWalker (1,000; mazes 4,000)."""
+    filled_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Share of the buffer that must be filled before anything is replayed. Source: the authors' code (0.5)."""
+    replay_share: float = Field(default=0.8, gt=0.0, le=1.0)
+    """The chance that an iteration replays, once the buffer is filled so far. Source: Parker-Holder et al. 2022, mazes
+    (0.8)."""
+    batch: int = Field(default=32, ge=1, le=10_000)
+    """Contexts of an iteration, which are played in turn, as far as its steps go. Source: the authors' code (32 at
+    once)."""
+    edits: int = Field(default=5, ge=1, le=1000)
+    """Small changes that make one context of another. Source: Parker-Holder et al. 2022, mazes (5)."""
+    edited: Literal["easiest", "batch"] = "easiest"
+    """What of a replay is edited. easiest: the four contexts of highest mean return less score. batch: all. Source:
+    Parker-Holder et al. 2022, mazes (easy)."""
+    score: Literal["positive_value_loss", "value_l1", "max_mc"] = "positive_value_loss"
+    """What contexts are kept and ranked by. positive_value_loss: mean max(GAE, 0). value_l1: mean |GAE|.
+    max_mc: the highest discounted return that an episode on it had so far, minus its start value. Source:
+    Parker-Holder et al. 2022 (positive value loss)."""
+    temperature: float = Field(default=0.3, gt=0.0)
+    """Beta: the chance of rank r is proportional to r^(-1/beta). Source: the authors' code (0.3)."""
+    staleness_share: float = Field(default=0.3, ge=0.0, le=1.0)
+    """Rho: weight of the episodes since a context was last played. Source: the authors' code (0.3)."""
+    robust: bool = True
+    """Learn from replayed contexts only: rounds of new and of edited ones are played and scored, charged to the budget,
+    and not learned from. Source: Parker-Holder et al. 2022."""
 
 
 class LearnabilityConfig(CurriculumSection):

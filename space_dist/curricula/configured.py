@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from space_dist.config import (
+    AccelConfig,
     AlpGmmConfig,
     ContextSpaceConfig,
     CurriculumConfig,
@@ -30,9 +32,11 @@ from space_dist.config import (
     WatchedConfig,
 )
 from space_dist.curricula import variants
+from space_dist.curricula.accel import Accel, Replays
 from space_dist.curricula.custom import Custom, make_custom
 from space_dist.curricula.draws import Draws, Uniform
 from space_dist.curricula.edge import Edge
+from space_dist.curricula.generating import ContextGenerator, Unheld
 from space_dist.curricula.interface import Curriculum, FloatArray
 from space_dist.curricula.learnability import Learnability
 from space_dist.curricula.learning_progress import LearningProgress
@@ -43,7 +47,7 @@ from space_dist.curricula.round_robin import RoundRobin
 from space_dist.curricula.space import Space
 from space_dist.curricula.vds import ValueDisagreement
 from space_dist.curricula.watching import Watched
-from space_dist.errors import ConfigError, nearest
+from space_dist.errors import ConfigError, about, nearest
 from space_dist.instances import ContextBounds, InstanceSet
 
 if TYPE_CHECKING:  # SciPy takes half a second to import, and few curricula need it
@@ -60,13 +64,15 @@ class Makers:
     draws: how many a round can use.
     bounds: of the contexts of the environment.
     recorded: what another run was trained on, for who follows it.
+    generator, held_out: as for `make_curriculum`.
     """
 
     def __init__(
         self, train: InstanceSet, *, source: str, seed: int, draws: Draws, bounds: ContextBounds,
-        recorded: bytes | None = None,
+        recorded: bytes | None = None, generator: Callable[[], ContextGenerator] | None = None,
+        held_out: InstanceSet | None = None,
     ) -> None:  # fmt: skip
-        self._recorded = recorded
+        self._recorded, self._generator, self._held_out = recorded, generator, held_out
         self._train, self._source, self._seed, self._draws, self._bounds = train, source, seed, draws, bounds
 
     def make(self, settings: CurriculumConfig) -> Curriculum:
@@ -83,6 +89,7 @@ class Makers:
             ValueDisagreementConfig: self._value_disagreement,
             AlpGmmConfig: self._alp_gmm,
             LevelReplayConfig: self._level_replay,
+            AccelConfig: self._accel,
             LearnabilityConfig: self._learnability,
             ProximalConfig: self._proximal,
             LearningProgressConfig: self._learning_progress,
@@ -169,6 +176,21 @@ class Makers:
             self._train, seed=self._seed, draws=self._draws, temperature=settings.temperature,
             staleness_share=settings.staleness_share, within_update=settings.within_update, score=settings.score,
             robust=Robust(settings.replay_share, settings.scored_share) if settings.robust else None,
+        )  # fmt: skip
+
+    def _accel(self, settings: AccelConfig) -> Accel:
+        if self._generator is None:
+            raise ConfigError("curriculum.kind: accel generates contexts of an environment, and here none is known")
+        with about("curriculum.kind: accel"):
+            source = Unheld(self._generator(), None if self._held_out is None else self._held_out.contexts)
+        replays = Replays(
+            settings.replay_share, max(1, math.ceil(settings.filled_share * settings.buffer)), settings.temperature,
+            settings.staleness_share,
+        )  # fmt: skip
+        return Accel(
+            seed=self._seed, draws=self._draws, source=source, buffer=settings.buffer, batch=settings.batch,
+            new_from=self._train if settings.new_from == "set" else None, edits=settings.edits,
+            edited=settings.edited, score=settings.score, replays=replays, robust=settings.robust,
         )  # fmt: skip
 
     def _learnability(self, settings: LearnabilityConfig) -> Learnability:

@@ -12,13 +12,14 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, get_args
 
 import numpy as np
 
 from space_dist.curricula.draws import Draws
 from space_dist.curricula.interface import (
     GENERATED,
+    AdvantagePart,
     Curriculum,
     Episodes,
     Feedback,
@@ -175,6 +176,11 @@ class Custom(Curriculum):
             )
         if wants.advantages and not wants.episodes:
             self._refuse("it wants advantages, which are told by episode, and no episodes: set Wants(episodes=True)")
+        if wants.advantage_part not in get_args(AdvantagePart):
+            self._refuse(
+                f"its `wants` has advantage_part {wants.advantage_part!r:.60}"
+                f"{nearest(str(wants.advantage_part), get_args(AdvantagePart))} Allowed: size, positive"
+            )
         if wants.success and not wants.episodes:
             self._refuse("it wants success, which is told by episode, and no episodes: set Wants(episodes=True)")
         return wants

@@ -6,7 +6,7 @@ import abc
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Numbers = dict[str, float | int | bool | None]
+AdvantagePart = Literal["size", "positive"]
 
 GENERATED = -1  # the id, and the index, of a context that is not of the instance set
 
@@ -53,7 +54,8 @@ class Episodes:
     returns, discounted_returns: (m,) in reward units.
     lengths: (m,) in steps.  success: (m,) 1 or 0, NaN where the environment knows no success.
     start_values: (m,) V(s0, c) behind the iteration's updates, in reward units.
-    advantages: (m,) mean |GAE| over the episode's steps, in reward units; NaN for learners without advantages.
+    advantages: (m,) mean |GAE| over the episode's steps, or mean max(GAE, 0), as `Wants.advantage_part` says, in reward
+        units; NaN for learners without advantages.
     running: (k,) the instances, one an episode, of what had begun and not ended when the iteration did; into the set.
     """
 
@@ -109,6 +111,7 @@ class Wants:
 
     episodes: `Feedback.episodes`.
     advantages: `Episodes.advantages`, which only learners with advantages have.
+    advantage_part: what of each step's advantage these are means of. size: |GAE|.  positive: max(GAE, 0).
     ensemble: an ensemble of value functions, trained on the rollouts, and its `Feedback.ensemble`.
     probes: to be asked, by `Curriculum.probes`, which instances shall be probed; the environment must report success.
     success: `Episodes.success`, which only some environments report.
@@ -117,10 +120,16 @@ class Wants:
 
     episodes: bool = False
     advantages: bool = False
+    advantage_part: AdvantagePart = "size"
     ensemble: bool = False
     probes: bool = False
     success: bool = False
     unlearned: bool = False
+
+    def counted(self, advantages: FloatArray) -> FloatArray:
+        """What of each GAE counts: an array of the same shape and units."""
+        parts: FloatArray = np.abs(advantages) if self.advantage_part == "size" else np.maximum(advantages, 0.0)
+        return parts
 
 
 @dataclass(frozen=True)

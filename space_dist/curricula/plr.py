@@ -1,4 +1,4 @@
-"""Prioritised level replay (Jiang et al. 2021) over a finite set, by mean |GAE| (`value_l1`) or by `max_mc`.
+"""Prioritised level replay (Jiang et al. 2021) over a finite set, by an episode's advantages or its highest return.
 
 The paper decides before every episode; here the episodes of an iteration are drawn at once, for scores are only known
 behind its update. Drawn from the paper's chances as they stand (`fixed_chances`), nearly all episodes of an iteration
@@ -8,9 +8,10 @@ and its staleness is 0. So by default what was drawn leaves the ranking until ev
 (`without_repetition`), and staleness grows with every draw. What still runs when an iteration ends was drawn, too: its
 score is not known yet, and it is not begun a second time meanwhile.
 
-`max_mc` and `robust` are those of Jiang et al. 2021, "Replay-Guided Adversarial Environment Design": a regret is
-estimated by the highest return that was seen, and the learner learns from what was replayed only. New levels are there
-drawn from a generator; here an iteration that explores draws from the whole set, all alike.
+`positive_value_loss`, `max_mc` and `robust` are those of Jiang et al. 2021, "Replay-Guided Adversarial Environment
+Design": a regret is estimated by what turned out better than the value function expected, mean max(GAE, 0), or by the
+highest return that was seen, and the learner learns from what was replayed only. New levels are there drawn from a
+generator; here an iteration that explores draws from the whole set, all alike.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, UInt64Array, generator, instance_keys
 
 WithinUpdate = Literal["without_repetition", "fixed_chances"]
-Score = Literal["value_l1", "max_mc"]
+Score = Literal["value_l1", "positive_value_loss", "max_mc"]
 _COIN = 1  # a stream of random numbers beside that of the draws
 
 
@@ -55,8 +56,8 @@ class Robust:
 class ReplayState(DrawnState):
     """chances: (n,) the paper's, as of the first draw.
 
-    scores: (n,) in reward units: mean |GAE| when an instance was last trained on, or for max_mc the highest return less
-        the start value as of now; 0 where it never was.
+    scores: (n,) in reward units: mean |GAE| or mean max(GAE, 0) when an instance was last trained on, or for max_mc the
+        highest return less the start value as of now; 0 where it never was.
     last: (n,) the episode of the run, counted from 0, in which it was last trained on; -1 where it never was.
     episodes: how many the run has trained on.
     running: (k,) indices of the instances of which an episode runs on, ascending.
@@ -88,7 +89,10 @@ class LevelReplay(Drawn):
         super().__init__(instances, seed=seed, draws=draws)
         self._temperature, self._staleness_share = temperature, staleness_share
         self._within_update, self._score, self._robust = within_update, score, robust
-        self.wants = Wants(episodes=True, advantages=score == "value_l1", unlearned=robust is not None)
+        self.wants = Wants(
+            episodes=True, advantages=score != "max_mc", unlearned=robust is not None,
+            advantage_part="positive" if score == "positive_value_loss" else "size",
+        )  # fmt: skip
         self._ties = instance_keys(seed, Purpose.TIES, instances.ids, instances.contexts)
 
     def start(self) -> tuple[ReplayState, Selection]:
@@ -101,7 +105,7 @@ class LevelReplay(Drawn):
         return state, self.selection(state)
 
     def step(self, state: ReplayState, feedback: Feedback) -> tuple[ReplayState, Selection, Numbers]:
-        """Score what was played, and weigh anew. An instance played more than once has its episodes' mean |GAE|."""
+        """Score what was played, and weigh anew. An instance played more than once has its episodes' mean."""
         episodes = needed_episodes(feedback, "PLR")
         n, m = len(self._instances), len(episodes.indices)
         last = state.last.copy()

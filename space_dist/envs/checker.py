@@ -23,6 +23,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, close, distribution_of, make_batched
+from space_dist.envs.generating import EnvironmentGenerator, own_method
 from space_dist.envs.interface import FloatArray, Step
 from space_dist.envs.observations import Observations
 from space_dist.errors import ConfigError, SpaceDistError
@@ -33,6 +34,7 @@ from space_dist.system.findings import FaultError, Findings
 COMPARED_STEPS: Final = 200  # of an episode; horizons are played to their end once
 N_CONTEXTS: Final = 8
 N_EPISODES: Final = 3  # replayed in every setting
+_EDITS: Final = 3  # of each context
 _ROUNDED: Final = "precision lowered by casting to float32"  # in a warning of Gymnasium's Box
 
 
@@ -110,6 +112,7 @@ class _Check:
         self._check_earlier_episodes(reference)
         self._check_neighbours(reference)
         self._check_contexts()
+        self._check_edits()
         with self._single() as single:
             if single is not None:
                 self._check_context_survives(single)
@@ -230,6 +233,29 @@ class _Check:
                     f"changing {name!r} alone, from {lowest[column]:g} to {highest[column]:g}, changed nothing in an "
                     "episode of random actions; see whether it is used at all"
                 )
+
+    def _check_edits(self) -> None:
+        """Contexts that the environment makes of others: the same whenever it is asked, and such as it can play."""
+        with self._opened(1) as env:
+            if own_method(env, "edit_contexts") is None:
+                return
+        source = EnvironmentGenerator(self._opened, "the environment")
+
+        def edited() -> FloatArray:
+            return source.edit(generator(0, Purpose.GENERATION), self._contexts, _EDITS)
+
+        found = _called("edit_contexts()", edited)
+        if found.tobytes() != _called("edit_contexts()", edited).tobytes():
+            raise FaultError(
+                "edit_contexts() is not a function of its arguments: with the same generator and contexts it gave "
+                "others. Draw random numbers from the generator that it is given alone"
+            )
+        with self._opened(len(found)) as env:
+            self._reset(env, np.arange(len(found)), found, self._seeds[: len(found)])
+        if np.array_equal(found, self._contexts):
+            self._findings.notes.append(
+                f"edit_contexts() changed nothing in {len(found)} contexts, {_EDITS} times each"
+            )
 
     def _ask_gymnasium(self) -> None:
         """Gymnasium's own checker, on a copy that nothing was done to."""

@@ -135,6 +135,22 @@ class DrawsContexts(Protocol):
 
 
 @runtime_checkable
+class EditsContexts(Protocol):
+    """An environment, batched or single, whose contexts can be changed a little and stay contexts."""
+
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:
+        """`(n, d)` the (n, d) contexts, each after `edits` small changes of its own, within the bounds."""
+
+
+@runtime_checkable
+class Canonical(Protocol):
+    """An environment, batched or single, of which contexts that differ in their numbers may mean the same."""
+
+    def canonical(self, contexts: FloatArray) -> FloatArray:
+        """`(n, ...)` rows that are equal where two of the (n, d) contexts mean the same."""
+
+
+@runtime_checkable
 class DrawsUnsolvable(Protocol):
     """An environment, batched or single, that knows of contexts in which no policy succeeds."""
 

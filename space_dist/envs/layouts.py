@@ -110,6 +110,45 @@ def carve(rng: np.random.Generator, n: int, *, raw: bool = False, side: int = SI
     return layouts if raw else symmetrised(layouts)
 
 
+def toggled(rng: np.random.Generator, layouts: Layouts, count: int) -> Layouts:
+    """`(n, cells)` the layouts, symmetrised, in each of which `count` inner walls were opened or closed.
+
+    These are drawn anew for each layout, and different; all of them, if there are fewer.
+    """
+    found = symmetrised(layouts)
+    beside = neighbours(math.isqrt(layouts.shape[1]))
+    walls = np.argwhere(beside[:, [EAST, SOUTH]] >= 0)  # each once: from the cell on its western or northern side
+    for layout in found:
+        for cell, side in walls[rng.choice(len(walls), size=min(count, len(walls)), replace=False)].tolist():
+            action = (EAST, SOUTH)[side]
+            sign = -1 if int(layout[cell]) & int(BITS[action]) else 1
+            layout[cell] += sign * BITS[action]
+            layout[beside[cell, action]] += sign * BITS[OPPOSITE[action]]
+    return found
+
+
+def grown(rng: np.random.Generator, layout: Layouts) -> Layouts:
+    """`(cells,) -> (larger,)` the symmetrised layout with a column in the east and a row in the south more.
+
+    Each new cell is open towards the cell to its west, or in the row to its north; the new corner, which is the goal,
+    towards one of both. So there is a way to it if there was one to the corner before.
+    """
+    side = math.isqrt(len(layout))
+    larger = placed(layout[None], side + 1)[0].reshape(side + 1, side + 1)
+    larger[:side, side - 1] += BITS[EAST]
+    larger[:side, side] += BITS[WEST]
+    larger[side - 1, :side] += BITS[SOUTH]
+    larger[side, :side] += BITS[NORTH]
+    if rng.integers(2):
+        larger[side, side - 1] += BITS[EAST]
+        larger[side, side] += BITS[WEST]
+    else:
+        larger[side - 1, side] += BITS[SOUTH]
+        larger[side, side] += BITS[NORTH]
+    flat: Layouts = larger.ravel()
+    return flat
+
+
 def walled_off(rng: np.random.Generator, layouts: Layouts) -> Layouts:
     """`(n, cells)` the symmetrised perfect mazes, each with one passage of its way to the last cell closed.
 

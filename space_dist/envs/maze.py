@@ -12,7 +12,17 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.interface import Distribution, FloatArray, IntArray, Step
-from space_dist.envs.layouts import SIDE, START, Cells, carve, shortest_ways, successors, symmetrised, walled_off
+from space_dist.envs.layouts import (
+    SIDE,
+    START,
+    Cells,
+    carve,
+    shortest_ways,
+    successors,
+    symmetrised,
+    toggled,
+    walled_off,
+)
 from space_dist.instances import ContextBounds
 
 GOAL_REWARD = 1.0
@@ -99,6 +109,14 @@ class BatchedMaze:
     def draw_unsolvable(self, rng: np.random.Generator, n: int) -> FloatArray:
         """`(n, d)` perfect mazes with one passage of the way to the goal closed."""
         return walled_off(rng, carve(rng, n))
+
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:
+        """`(n, d)` the mazes, in each of which `edits` inner walls were opened or closed; some have no way through."""
+        return toggled(rng, contexts, edits)
+
+    def canonical(self, contexts: FloatArray) -> FloatArray:
+        """`(n, d)` with the numbers of layouts of which both sides of a passage say that it is open."""
+        return symmetrised(contexts)
 
     def optimal_returns(self, contexts: FloatArray) -> FloatArray:
         """`(n, d) -> (n,)` undiscounted returns of the shortest ways: 1 - 0.004 (L - 1) for L moves in a 5x5 maze.

@@ -10,12 +10,13 @@ from typing import ClassVar, Final
 import numpy as np
 
 from space_dist.envs.interface import Distribution, FloatArray
-from space_dist.envs.layouts import Cells, carve, placed, successors, walled_off
+from space_dist.envs.layouts import Cells, carve, cut_out, grown, placed, successors, symmetrised, toggled, walled_off
 from space_dist.envs.maze import BatchedMaze
 from space_dist.instances import ContextBounds
 
 LEAST, MOST = 3, 11  # cells of a maze's side
 CELLS: Final = MOST**2
+GOAL_SHARE: Final = 0.25  # of edits that move the goal, as in the code of Parker-Holder et al. 2022
 
 BOUNDS: Final = ContextBounds(
     names=("side", *(f"cell_{x}_{y}" for y in range(MOST) for x in range(MOST))),
@@ -67,6 +68,28 @@ class BatchedMixedMaze(BatchedMaze):
     def draw_unsolvable(self, rng: np.random.Generator, n: int) -> FloatArray:
         """`(n, 122)` perfect mazes with one passage of the way to the goal closed, every side as likely."""
         return draw(rng, n, solvable=False)
+
+    def edit_contexts(self, rng: np.random.Generator, contexts: FloatArray, edits: int) -> FloatArray:
+        """`(n, 122)` the mazes, each after `edits` changes; some have no way through.
+
+        One change of four, by chance, moves the goal: the maze loses its last column and row, or gains ones. The others
+        open or close an inner wall.
+        """
+        found = np.zeros_like(contexts)
+        for edited, context in zip(found, contexts, strict=True):
+            side = int(context[0])
+            layout = symmetrised(cut_out(context[None, 1:], side))[0]
+            moves = int((rng.random(edits) < GOAL_SHARE).sum())
+            for _ in range(moves):
+                larger = side == LEAST or (side < MOST and bool(rng.integers(2)))
+                layout = grown(rng, layout) if larger else symmetrised(cut_out(layout[None], side - 1))[0]
+                side += 1 if larger else -1
+            edited[0], edited[1:] = side, placed(toggled(rng, layout[None], edits - moves), MOST)[0]
+        return found
+
+    def canonical(self, contexts: FloatArray) -> FloatArray:
+        """`(n, 122)` with the numbers of layouts of which both sides of a passage say that it is open."""
+        return np.concatenate([contexts[:, :1], symmetrised(contexts[:, 1:])], axis=1)
 
     def _read(self, contexts: FloatArray) -> tuple[FloatArray, Cells]:
         """`(n, 122) -> (n, 121), (n,)` layouts in the square, and the side of each maze.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import Any
 from gymnasium import spaces
 
 from space_dist.envs import BULLET_IDS, BatchedEnv, close, make_batched, unwrapped
+from space_dist.envs.generating import EnvironmentGenerator
 from space_dist.envs.interface import Compilable, FloatArray, knows_success, opened, starts_alike
 from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError
@@ -53,6 +55,11 @@ class EnvironmentSpec:
     def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
         """A new environment for as long as the context lasts."""
         return opened(self.make, n_slots)
+
+    def generator(self) -> EnvironmentGenerator:
+        """What makes contexts of this environment, and edits them. Raises ConfigError if they cannot be edited."""
+        plain = dataclasses.replace(self, compiled=False)  # it takes no step
+        return EnvironmentGenerator(plain.opened, f"env.id {self.env_id!r}")
 
     def knows_success(self, contexts: FloatArray) -> bool:
         """Whether a first step in a (1, d) context reports success, true or not.

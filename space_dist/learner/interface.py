@@ -35,7 +35,7 @@ NOT_A_NUMBER = "a weight is not a number"
 class Update:
     """What one update reported: SB3's own training metrics, and how many optimiser steps the scored network took.
 
-    advantages: (length, slots of all shards) |GAE| of each transition, in reward units; None for learners without
+    advantages: (length, slots of all shards) GAE of each transition, in reward units; None for learners without
         advantages.
     """
 
@@ -140,7 +140,7 @@ class SB3Learner(abc.ABC):
         total_steps: int,
     ) -> None:
         self._config, self._seed, self._total_steps = config, seed, total_steps
-        self._advantages: NDArray[np.float64] | None = None  # their sizes, in the last update
+        self._advantages: NDArray[np.float64] | None = None  # of the last update
         self._acted: Mapping[str, NDArray[Any]] | None = None  # for the present one
         refuse_spaces(config, observation_space, action_space)
         self._normaliser = (
@@ -258,12 +258,12 @@ class SB3Learner(abc.ABC):
         require_order(shards)
         self._acted = acted
         with _divergence_explained(round), _seeded(self._seed, Purpose.UPDATE, round):
-            sizes = self._sizes(shards)
+            advantages = self._gae(shards)
         self.observe(shards)
-        return Update({}, 0, sizes)
+        return Update({}, 0, advantages)
 
-    def _sizes(self, shards: Sequence[Shard]) -> NDArray[np.float64]:  # noqa: ARG002 - on-policy learners need them
-        """|GAE| of each transition, as `Update.advantages`."""
+    def _gae(self, shards: Sequence[Shard]) -> NDArray[np.float64]:  # noqa: ARG002 - on-policy learners need them
+        """GAE of each transition, as `Update.advantages`."""
         raise RuntimeError(f"{type(self.model).__name__} computes no advantages")
 
     def _learnt(self, shards: Sequence[Shard], before: int) -> Update:

@@ -140,7 +140,7 @@ class OnPolicyLearner(SB3Learner):
         )
 
     def _learn(self, shards: Sequence[Shard], *, steps: int) -> None:
-        self._advantages = self._sizes(shards)  # before `train` lays them out in its own way
+        self._advantages = self._gae(shards)  # before `train` lays them out in its own way
         if leaves_policy(self._settings, shards):
             self.model.rollout_buffer.advantages[:] = 0.0
         self.model.num_timesteps = steps
@@ -148,11 +148,11 @@ class OnPolicyLearner(SB3Learner):
         self.model._update_current_progress_remaining(steps, self._total_steps)
         self.model.train()
 
-    def _sizes(self, shards: Sequence[Shard]) -> NDArray[np.float64]:
+    def _gae(self, shards: Sequence[Shard]) -> NDArray[np.float64]:
         with self._weights(self._acted):
             advantages = self.fill(shards).advantages
-        sizes: NDArray[np.float64] = np.abs(advantages, dtype=np.float64) * self.statistics.reward_std
-        return sizes
+        scaled: NDArray[np.float64] = advantages.astype(np.float64) * self.statistics.reward_std
+        return scaled
 
     def fill(self, shards: Sequence[Shard]) -> RolloutBuffer:
         """Fill SB3's rollout buffer: values and log-probabilities by its policy, returns and advantages by its buffer.

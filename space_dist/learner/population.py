@@ -148,7 +148,7 @@ class PopulationLearner(OnPolicyLearner):
             metrics["std"] = torch.exp(model.policy.log_std).mean().item()
         for name, metric in metrics.items():
             model.logger.record(f"train/{name}", metric)
-        self._advantages = np.abs(collected.advantages, dtype=np.float64) * self.statistics.reward_std
+        self._advantages = collected.advantages.astype(np.float64) * self.statistics.reward_std
         return self._learnt(collected.shards, before)
 
 

@@ -30,6 +30,7 @@ LINE_STYLES: Final = ("-", "--", ":", "-.")
 MAX_ROWS: Final = 500
 MAX_COLUMNS: Final = 1000
 MAX_LABELLED_INSTANCES: Final = 30
+MAX_FEATURES: Final = 16  # of contexts, each with a panel
 MAX_MARKED: Final = 40  # a line of fewer evaluations shows each: one alone would be invisible
 MAX_WRITTEN: Final = 160  # places of a heat map that still have room for numbers
 _PANEL_COLUMNS: Final = 3
@@ -250,13 +251,14 @@ def draw_curriculum(run: Run) -> Figure:
 def draw_contexts(run: Run) -> Figure:
     """Generated contexts over real environment steps: mean and standard deviation of each feature in each iteration.
 
-    With the target's, and the divergence from it, where the curriculum logged them. Raises LedgerError if no context
-    was generated, or not in every iteration.
+    Of more than 16 features the first 16, as the title says. With the target's, and the divergence from it, where the
+    curriculum logged them. Raises LedgerError if no context was generated, or not in every iteration.
     """
     generated, features, decisions = run.contexts, run.features, run.decisions
     if not generated or len(generated) != len(run.set_sizes):
         raise LedgerError(f"{run.ledger.folder} was not trained on generated contexts in every iteration")
-    names = features[: generated[0].shape[1]]
+    every = features[: generated[0].shape[1]]
+    names = every[:MAX_FEATURES]
     divergences = [(steps, numbers["kl_to_target"]) for steps, numbers in decisions if "kl_to_target" in numbers]
     panels = len(names) + bool(divergences)
     columns = 2 if panels <= 4 else 4
@@ -280,7 +282,8 @@ def draw_contexts(run: Run) -> Figure:
         _dress(axes[len(names)], "", "KL to the target (nats)")
     for empty in axes[panels:]:
         empty.set_axis_off()
-    figure.suptitle(f"{run.status.name}, seed {run.status.seed}: generated contexts", fontsize=11)
+    some = f", {len(names)} of {len(every)} features" if len(names) < len(every) else ""
+    figure.suptitle(f"{run.status.name}, seed {run.status.seed}: generated contexts{some}", fontsize=11)
     figure.legend(handles=axes[0].get_lines(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 def curriculum_episodes(train: InstanceSet, shards: Sequence[Shard], advantages: FloatArray | None) -> Episodes:
     """A round's episodes for the curriculum, shard after shard; their start values are not known.
 
-    advantages: (m,) mean |GAE| of each; None where nobody asks for it.
+    advantages: (m,) as `Episodes.advantages`; None where nobody asks for it.
     """
     tables = [shard.episodes for shard in shards]
 

@@ -130,7 +130,7 @@ class Blueprint:
             refuse_population(config.learner, spec.observation_space, spec.action_space)
         self._refuse_equal_starts(train)
         # Asks the curriculum for what is not there? Better refused now than on an actor.
-        curriculum = self.curriculum(train)
+        curriculum = self.curriculum(train, test)
         self._refuse_wants(curriculum)
         self._refuse_recording(curriculum)
         self.ensemble()
@@ -138,9 +138,14 @@ class Blueprint:
             start_from(self.learner(), self.given["init_from"])
         return setup
 
-    def curriculum(self, train: InstanceSet) -> Curriculum:
-        """The curriculum over `train`. Raises ConfigError if it asks for instances or features that are not there."""
-        return make_curriculum(self.config, train, self.spec.context_bounds, self.given)
+    def curriculum(self, train: InstanceSet, test: InstanceSet) -> Curriculum:
+        """The curriculum over `train`, which trains on nothing of `test`.
+
+        Raises ConfigError if it asks for instances or features that are not there.
+        """
+        return make_curriculum(
+            self.config, train, self.spec.context_bounds, self.given, generator=self.spec.generator, held_out=test
+        )
 
     def learner(self) -> Learner:
         """The learner, or all of several policies, with initial networks."""

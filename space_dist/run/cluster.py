@@ -6,7 +6,7 @@ Imports neither Ray nor torch: rollout and curriculum actors are made of this mo
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -15,6 +15,7 @@ import numpy as np
 
 from space_dist.config import CurriculumConfig, RunConfig
 from space_dist.curricula import Curriculum, Episodes, Feedback, Probes, Selection, State
+from space_dist.curricula.generating import ContextGenerator
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds, InstanceSet
@@ -176,23 +177,28 @@ class CurriculumHost:
 
 
 class Central(CurriculumHost):
-    """The host of a run's curriculum."""
+    """The host of a run's curriculum. Its arguments are those of `make_curriculum`."""
 
     def __init__(
         self, config: RunConfig, train: InstanceSet, bounds: ContextBounds,
-        given: Mapping[str, bytes] = MappingProxyType({}),
+        given: Mapping[str, bytes] = MappingProxyType({}), *,
+        generator: Callable[[], ContextGenerator] | None = None, held_out: InstanceSet | None = None,
     ) -> None:  # fmt: skip
         from space_dist.curricula.making import make_curriculum
 
-        super().__init__(make_curriculum(config, train, bounds, given), config.curriculum)
+        made = make_curriculum(config, train, bounds, given, generator=generator, held_out=held_out)
+        super().__init__(made, config.curriculum)
 
 
 class InProcess:
     """The cluster's twin without Ray: everything at once, here. Same bits."""
 
     def __init__(self, config: RunConfig, setup: Setup) -> None:
-        self._setup, self._central = setup, Central(config, setup.train, setup.spec.context_bounds, setup.given)
-        self._worker = Worker(setup)
+        self._setup, self._worker = setup, Worker(setup)
+        self._central = Central(
+            config, setup.train, setup.spec.context_bounds, setup.given, generator=setup.spec.generator,
+            held_out=setup.test,
+        )  # fmt: skip
 
     def put(self, value: object) -> Handle:
         """The value itself."""

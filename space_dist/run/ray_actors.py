@@ -63,7 +63,10 @@ class CurriculumActor(_Timed, Central):
     def __init__(self, config: RunConfig, setup: Setup, folders: Sequence[str]) -> None:
         look_in(folders)
         threadpool_limits(limits=1)
-        super().__init__(config, setup.train, setup.spec.context_bounds, setup.given)
+        super().__init__(
+            config, setup.train, setup.spec.context_bounds, setup.given, generator=setup.spec.generator,
+            held_out=setup.test,
+        )  # fmt: skip
 
 
 def name_of(index: int) -> str:

@@ -49,7 +49,7 @@ def _recorded(ledger: Ledger) -> Recording:
         )
     ledger.read(ledger.config)
     blueprint = Blueprint.of(configs.load(ledger.config))
-    train, _ = blueprint.instances()
+    train, test = blueprint.instances()
     rows = ledger.rows(CURRICULUM, committed_only=True)
     ids = np.array([instance for row in rows for instance in row["trained"]], dtype=np.int64)
     contexts = [
@@ -59,7 +59,7 @@ def _recorded(ledger: Ledger) -> Recording:
     if not len(ids):
         raise ConfigError(f"{_KEY}: no episode ended in the run in {ledger.folder}")
     return Recording(
-        drawn=blueprint.curriculum(train).start()[1].drawn,
+        drawn=blueprint.curriculum(train, test).start()[1].drawn,
         budget_steps=status.budget_steps,
         round_steps=blueprint.config.round_steps(blueprint.spec.horizon),
         lengths=np.array([len(row["trained"]) for row in rows], dtype=np.int64),

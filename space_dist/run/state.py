@@ -84,7 +84,7 @@ class RunState:
     version: of the selection being trained on.  walk: where the next round goes on in it.
     rows: of the ledger.  evaluated_at: steps at the last evaluation.
     rollouts, updates, gradient_steps: what this iteration's rounds and updates showed.
-    sizes: (slots,) sums of |GAE| over running episodes, where anyone asks.
+    sizes: (slots,) sums of what counts of their advantages over running episodes, where anyone asks.
     curriculum_number: curricula that were in force before the one whose state is stored.
     """
 

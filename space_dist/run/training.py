@@ -129,7 +129,7 @@ class Training:
         self._total_steps = blueprint.total_steps
         self.learner = blueprint.learner()
         self.ensemble = blueprint.ensemble()
-        self._curriculum = blueprint.curriculum(setup.train)
+        self._curriculum = blueprint.curriculum(setup.train, setup.test)
         self._run, self._asked = RunState(), _InFlight()
         self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()
@@ -416,12 +416,12 @@ class Training:
         run.gradient_steps += update.gradient_steps
 
     def _advantages(self, shards: list[Shard], update: Update) -> NDArray[np.float64] | None:
-        """`(m,)` the mean |GAE| of each episode that ended, if the curriculum asks for it, earlier rounds included."""
-        run = self._run
-        if not self._curriculum.wants.advantages or update.advantages is None:
+        """`(m,)` as `Episodes.advantages`, of each that ended, if the curriculum asks for it; earlier rounds count."""
+        run, wants = self._run, self._curriculum.wants
+        if not wants.advantages or update.advantages is None:
             return None
         before = np.zeros(update.advantages.shape[1]) if run.sizes is None else run.sizes
-        means, run.sizes = mean_sizes(shards, update.advantages, before)
+        means, run.sizes = mean_sizes(shards, wants.counted(update.advantages), before)
         return means
 
     def _finish(self) -> Work[None]:

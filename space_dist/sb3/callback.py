@@ -24,7 +24,8 @@ class CurriculumCallback(BaseCallback):
     """Has a curriculum choose what a model that learns on a `ContextVecEnv` is trained on.
 
     kind: which curriculum, as `curriculum.kind` of a config: space, cspace, round_robin, fixed, random_growth, manual,
-        uniform, spdrl, vds, alp_gmm, plr, learnability, procurl, learning_progress, edge or currot (docs/curricula.md).
+        uniform, spdrl, vds, alp_gmm, plr, accel, learnability, procurl, learning_progress, edge or currot
+        (docs/curricula.md).
     settings: its settings, by name, as under `curriculum` of a config (`space-dist config schema` explains them).
     passes: length of an iteration: as many rounds as cover this many passes over the selected instances.
     start_states: seeded start observations per instance whose mean value is its start value.

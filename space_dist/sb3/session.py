@@ -46,6 +46,7 @@ from space_dist.curricula import (
 )
 from space_dist.curricula.configured import Makers
 from space_dist.envs import BatchedEnv
+from space_dist.envs.generating import EnvironmentGenerator
 from space_dist.envs.interface import knows_success, starts_alike
 from space_dist.envs.observations import put, take
 from space_dist.envs.spec import EnvironmentSpec
@@ -90,6 +91,10 @@ class _ScriptsSpec(EnvironmentSpec):
         """See `EnvironmentSpec`."""
         return self.maker(n_slots)
 
+    def generator(self) -> EnvironmentGenerator:
+        """See `EnvironmentSpec`."""
+        return EnvironmentGenerator(self.opened, "ContextVecEnv's environment")
+
 
 class Session:
     """One model's curriculum. Public fields are those that change from round to round; `_checkpoint` knows them all."""
@@ -102,11 +107,11 @@ class Session:
         self._restored_random: Mapping[str, Any] | None = None  # to go on with, behind the next `begin_round`
         self._open = False  # whether a rollout is being collected
         self._plan: RoundPlan | None = None  # of the round that is played
-        self._sizes_now: list[FloatArray] = []  # |GAE| of this round's rollouts
+        self._sizes_now: list[FloatArray] = []  # what counts of the advantages of this round's rollouts
         self._make()
         self.round = 0
         self.walk = Walk(-1, ())
-        self.sizes: FloatArray | None = None  # (n_envs,) sums of |GAE| over running episodes
+        self.sizes: FloatArray | None = None  # (n_envs,) sums of what counts of them over running episodes
         self.seen: list[Episodes] = []  # of this iteration's rounds
         self.gradient_steps = gradient_steps(model)  # as of the last decision
         self.scored: dict[str, NDArray[Any]] = {}  # weights that `values` belong to, where scales change
@@ -146,16 +151,16 @@ class Session:
                 "script has one; use aggregate: own"
             )
         source = "ContextVecEnv's instances"
-        makers = Makers(
-            env.instances, source=source, seed=env.run_seed, draws=Draws(self._length * env.num_envs, 1),
-            bounds=env.bounds,
-        )  # fmt: skip
-        self._host = CurriculumHost(makers.make(settings), settings)
-        self._wants = self._host.curriculum.wants
         spec = _ScriptsSpec(
             "", env.context_visible, {}, env.horizon, env.observation_space, env.action_space, env.bounds,
             maker=env.make_batched,
         )  # fmt: skip
+        makers = Makers(
+            env.instances, source=source, seed=env.run_seed, draws=Draws(self._length * env.num_envs, 1),
+            bounds=env.bounds, generator=spec.generator,
+        )  # fmt: skip
+        self._host = CurriculumHost(makers.make(settings), settings)
+        self._wants = self._host.curriculum.wants
         setup = Setup(
             spec=spec, seed=env.run_seed, gamma=self._gamma, shards=1, slots=env.num_envs, slot_length=self._length,
             start_states=self._asked.start_states, evaluation_episodes=1, train=env.instances, test=env.instances,
@@ -303,10 +308,10 @@ class Session:
         self._open = False
         if self._wants.advantages:
             model: Any = self._model
-            sizes: FloatArray = (
-                np.abs(model.rollout_buffer.advantages, dtype=np.float64) * self.wrapped.statistics.reward_std
+            advantages: FloatArray = (
+                model.rollout_buffer.advantages.astype(np.float64) * self.wrapped.statistics.reward_std
             )
-            self._sizes_now.append(sizes)
+            self._sizes_now.append(self._wants.counted(advantages))
 
     def on_training_end(self) -> bool:
         """A round ends with `learn`, unless its last rollout was broken off and will never be learnt from."""

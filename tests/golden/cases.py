@@ -122,6 +122,13 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "currot over the set": ("curricula/pointmass_currot", [
         *_LEAN, "budget.steps=512", _curriculum("kind: currot, delta: 0.253, particles: 16"),
     ]),
+    "accel": ("curricula/mixed_maze_accel", [
+        *_LEAN, "budget.steps=1024", "env.kwargs.horizon=14", "curriculum.buffer=8", "curriculum.batch=6",
+    ]),
+    "accel from the set": ("curricula/mixed_maze_accel", [
+        *_LEAN, "budget.steps=1024", "env.kwargs.horizon=24",
+        _curriculum("kind: accel, new_from: set, buffer: 6, batch: 4, edited: batch, score: max_mc, robust: false"),
+    ]),
     "replayed draws": ("curricula/pointmass_plr", _LEAN),
     "forked": ("pointmass_space", [
         *_LEAN, "fork={seed: 3, steps: 100}",
