@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sb3_contrib import TRPO
+from sb3_contrib import TRPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -20,7 +20,7 @@ from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
 from tests.test_learners import DISCRETE_LINE, LINE, N_STEPS, PARTS, config_for, learner_section
 
-CLASSES = {"ppo": PPO, "a2c": A2C, "trpo": TRPO, "dqn": DQN, "sac": SAC, "td3": TD3}
+CLASSES = {"ppo": PPO, "a2c": A2C, "trpo": TRPO, "recurrent_ppo": RecurrentPPO, "dqn": DQN, "sac": SAC, "td3": TD3}
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     **{kind: (kind, {}, {}) for kind in CLASSES},
     "lean": ("ppo", {"update": "lean"}, {}),

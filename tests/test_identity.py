@@ -52,6 +52,7 @@ COMPANIONS: dict[str, dict[str, Any]] = {
     "rollout.shards": {"learner.n_episodes": None},
     "rollout.slots": {"learner.n_episodes": None},
     "learner.n_episodes": {"rollout.shards": 1, "rollout.slots": 1},
+    "learner.shared_lstm": {"learner.enable_critic_lstm": False},
 }
 # Valid only together with others; see the tests of the fixed subset, the target, and what only some learners can.
 INSEPARABLE = (
@@ -91,6 +92,8 @@ def candidates(config: RunConfig, key: str, value: Any) -> list[Any]:
         return [value * 2 or 1, value / 2 or 0.5, *words]
     if isinstance(value, list):
         return [[32, 32], ["effort"], ["wandb"], [{"steps": 1, "set": {"learner.gamma": 0.5}}]]
+    if key == "learner.policy":  # each kind has its own
+        return [OTHER_WORDS[key], "CnnLstmPolicy"]
     return [OTHER_WORDS[key]] if key in OTHER_WORDS else [*words, 0.01, 1, [0.5, 0.5], ["a"]]
 
 
@@ -219,7 +222,7 @@ def test_learners_say_what_they_can_do() -> None:
     found = {ability: configs.learners_that(ability) for ability in
              ("has_advantages", "keeps_next_observations", "can_be_stacked")}  # fmt: skip
     assert found == {
-        "has_advantages": ["ppo", "trpo", "a2c"],
+        "has_advantages": ["ppo", "trpo", "a2c", "recurrent_ppo"],
         "keeps_next_observations": ["dqn", "sac", "td3"],
         "can_be_stacked": ["ppo", "trpo"],
     }

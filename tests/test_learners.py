@@ -19,6 +19,7 @@ from space_dist.envs.observations import Observations, rows
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.learner import make_learner
 from space_dist.learner.networks import TorchPolicy
+from space_dist.learner.recurrent import RecurrentTorchPolicy
 from space_dist.ledger import CURRICULUM, FORMAT, METRICS, Ledger, RunWriter, decode_checkpoint
 from space_dist.report import build_report, load_run
 from space_dist.rollout import Worker
@@ -30,7 +31,7 @@ from space_dist.system.interrupts import StopRequests
 
 LINE, DISCRETE_LINE, SCALED = "tests.tiny_env:make", "tests.tiny_env:make_discrete", "tests.tiny_env:make_scaled"
 IMAGE, PARTS = "tests.tiny_env:make_image", "tests.tiny_env:make_dict"
-KINDS = ("ppo", "a2c", "trpo", "dqn", "sac", "td3")
+KINDS = ("ppo", "a2c", "trpo", "recurrent_ppo", "dqn", "sac", "td3")
 RESULTS = (METRICS, CURRICULUM, "model.npz", "model.json")
 N_STEPS, ROUNDS = 40, 6  # five steps a slot: episodes, of eight, go on from round to round
 
@@ -38,6 +39,7 @@ LEARNERS: dict[str, dict[str, Any]] = {
     "ppo": {"batch_size": 32, "n_epochs": 2},
     "a2c": {},
     "trpo": {"batch_size": 32, "n_critic_updates": 2, "target_kl": 0.02},
+    "recurrent_ppo": {"batch_size": 16, "n_epochs": 2, "lstm_hidden_size": 8},
     "dqn": {"gradient_steps_per_step": 0.5, "target_update_interval": 100, "exploration_fraction": 0.5},
     "sac": {"gradient_steps_per_step": 0.25},
     "td3": {"gradient_steps_per_step": 0.25},
@@ -181,7 +183,7 @@ def test_runs_do_what_they_say(kind: str, references: Any) -> None:
         expected = (ROUNDS - 1) * N_STEPS * LEARNERS[kind]["gradient_steps_per_step"]
         assert iterations[0]["gradient_steps"] == 0
     else:
-        expected = {"ppo": 2 * 2, "a2c": 1, "trpo": 2 * 2}[kind] * ROUNDS
+        expected = {"ppo": 2 * 2, "a2c": 1, "trpo": 2 * 2, "recurrent_ppo": 2 * 3}[kind] * ROUNDS
     assert steps == expected
     if kind == "sac":
         log_alphas = [row["learner"]["log_alpha"] for row in iterations if row["gradient_steps"]]
@@ -195,7 +197,7 @@ def test_runs_do_what_they_say(kind: str, references: Any) -> None:
     )
     observations = np.random.default_rng(0).uniform(-1.0, 1.0, size=(9, 2)).astype(np.float32)
     for policy in (policy_of(ledger, blueprint.spec), learner.policy(ROUNDS)):
-        assert isinstance(policy, MlpPolicy)
+        assert isinstance(policy, RecurrentTorchPolicy if kind == "recurrent_ppo" else MlpPolicy)
         np.testing.assert_array_equal(policy.outputs(observations), learner.policy(0).outputs(observations))
         np.testing.assert_array_equal(policy.values(observations), learner.policy(0).values(observations))
 
@@ -217,7 +219,17 @@ def test_another_seed_is_another_run(kind: str, references: Any, tmp_path: Path)
 @pytest.mark.usefixtures("one_ray")
 @pytest.mark.parametrize(  # on-policy learners and off-policy ones meet every number; starting an actor takes seconds
     ("kind", "workers"),
-    [("ppo", 1), ("ppo", 4), ("a2c", 2), ("trpo", 1), ("dqn", 2), ("sac", 4), ("td3", 1)],
+    [
+        ("ppo", 1),
+        ("ppo", 4),
+        ("a2c", 2),
+        ("trpo", 1),
+        ("recurrent_ppo", 1),
+        ("recurrent_ppo", 4),
+        ("dqn", 2),
+        ("sac", 4),
+        ("td3", 1),
+    ],
 )
 def test_the_number_of_workers_changes_no_byte(kind: str, workers: int, references: Any, tmp_path: Path) -> None:
     config, _, expected = references[kind]
@@ -365,6 +377,8 @@ TORCH = {
     "ppo-image-and-context": ("ppo", "MultiInputPolicy", IMAGE, {}, True),
     "dqn-image": ("dqn", "CnnPolicy", IMAGE, {}, False),
     "ppo-dict": ("ppo", "MultiInputPolicy", PARTS, {}, True),
+    "recurrent-image": ("recurrent_ppo", "CnnLstmPolicy", IMAGE, {}, False),
+    "recurrent-dict": ("recurrent_ppo", "MultiInputLstmPolicy", PARTS, {}, True),
     "trpo-dict": ("trpo", "MultiInputPolicy", PARTS, {"discrete": True}, False),
     "dqn-dict": ("dqn", "MultiInputPolicy", PARTS, {"discrete": True}, True),
     "sac-dict": ("sac", "MultiInputPolicy", PARTS, {}, False),
@@ -429,7 +443,10 @@ def test_policies_through_torch_are_stable_baselines3s(name: str, tmp_path: Path
     assert len(told) == rows(observations) == 20
     with torch.no_grad():
         inputs, _ = network.obs_to_tensor(observations)
-        if kind in ("ppo", "trpo"):
+        if kind == "recurrent_ppo":
+            nothing = torch.zeros(1, 20, 8)
+            worth = network.predict_values(inputs, (nothing, nothing), torch.zeros(20))[:, 0]
+        elif kind in ("ppo", "trpo"):
             worth = network.predict_values(inputs)[:, 0]
         elif kind == "dqn":
             worth = network.q_net(inputs).max(dim=1).values
@@ -523,7 +540,7 @@ def test_a_budget_of_steps_ends_rounds_of_episodes_too(tmp_path: Path) -> None:
 # ---- collecting while updating ----
 
 
-@pytest.mark.parametrize("kind", ["ppo", "trpo", "a2c"])
+@pytest.mark.parametrize("kind", ["ppo", "trpo", "a2c", "recurrent_ppo"])
 def test_rounds_collected_ahead_are_the_same_wherever_and_after_any_interruption(kind: str, tmp_path: Path) -> None:
     curriculum = {"kind": "round_robin"}  # two rounds an iteration
     settings = {"rollout": {"shards": 4, "slots": 2, "overlap": True, "passes": 2.5}, "curriculum": curriculum}

@@ -16,7 +16,7 @@ from space_dist.envs import BatchedMaze, BatchedMixedMaze, ContextObservation, C
 from space_dist.envs.distributions import sample
 from space_dist.envs.layouts import carve, cut_out, placed, shortest_ways
 from space_dist.envs.mixed_maze import BOUNDS, draw
-from space_dist.instances import read_csv, refuse_overlap
+from space_dist.instances import InstanceSet, read_csv, refuse_overlap
 
 ENV_ID = "space_dist/MixedMaze-v0"
 INSTANCES = Path(__file__).parent.parent / "configs" / "instances"
@@ -68,6 +68,14 @@ def test_the_larger_sets_are_what_is_drawn_perfect_and_disjoint() -> None:
             square = context[1:].reshape(11, 11)
             assert not square[side:].any()
             assert not square[:, side:].any()
+
+
+def test_the_small_mazes_are_those_of_a_set_that_is_drawn() -> None:
+    for split, drawn in zip(("train", "test"), sample("mixed_maze", 1000, 1000, 1), strict=True):
+        small = drawn.contexts[:, 0] == 3
+        kept = read_csv(INSTANCES / f"mixed_maze_3x3_{split}.csv", BOUNDS)
+        assert kept == InstanceSet(drawn.ids[small], drawn.contexts[small], drawn.names)
+        assert len(kept) == {"train": 64, "test": 18}[split]
 
 
 def test_the_shortest_way_pays_the_optimum() -> None:

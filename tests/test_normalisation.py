@@ -70,7 +70,7 @@ def test_values_are_told_in_the_units_of_rewards(tmp_path: Path) -> None:
     np.testing.assert_allclose(values[1000.0], 1000.0 * values[1.0], rtol=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["ppo", "sac", "dqn"])
+@pytest.mark.parametrize("kind", ["ppo", "recurrent_ppo", "sac", "dqn"])
 def test_a_change_of_scale_is_no_progress(kind: str, tmp_path: Path) -> None:
     # Networks that stand still under scales that do not: before and after are compared under the same ones.
     learner = learner_section(kind, **NORMALISED, learning_rate=1e-12)
@@ -95,7 +95,7 @@ def test_the_first_scales_are_charged(tmp_path: Path) -> None:
     assert (rows[-1]["round"], rows[-1]["steps"]) == (ROUNDS - 1, ROUNDS * N_STEPS)
 
 
-@pytest.mark.parametrize("kind", ["ppo", "sac", "dqn"])
+@pytest.mark.parametrize("kind", ["ppo", "recurrent_ppo", "sac", "dqn"])
 def test_normalised_runs_resume(kind: str, tmp_path: Path) -> None:
     # Iterations of two rounds and more: runs stop within them, with weights that are not those last scored.
     config = config_for(

@@ -150,7 +150,7 @@ def test_what_goes_by_the_budget_is_not_made_longer(
     assert files(tmp_path / "run") == before
 
 
-@pytest.mark.parametrize("kind", ["ppo", "td3"])
+@pytest.mark.parametrize("kind", ["ppo", "recurrent_ppo", "td3"])
 def test_a_run_starts_from_what_another_has_learned(kind: str, tmp_path: Path) -> None:
     section = learner_section(kind, normalize_observations=True)
     first = space_dist.train(config_for(tmp_path, section), out=tmp_path / "first", progress=False)

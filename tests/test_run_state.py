@@ -97,7 +97,7 @@ def test_all_fields_come_back_together_and_lie_where_they_always_did() -> None:
     assert "curriculum_number" not in RunState().save()[0]
     assert data["walk"] == [4, [1, 6]]
     columns = [f"seen/{field.name}" for field in dataclasses.fields(Episodes)]
-    running = [f"unfinished/{field.name}" for field in dataclasses.fields(Unfinished)]
+    running = [f"unfinished/{field.name}" for field in dataclasses.fields(Unfinished) if field.name != "memory"]
     assert list(arrays) == ["scored/a/weight", "scored/bias", "acted/a/weight", *columns, *running, "sizes"]
     again = RunState.restored(stored(run), SETUP)
     assert plain(again) == plain(dataclasses.replace(run, seen=[joined_episodes(run.seen)]))
@@ -116,6 +116,22 @@ def test_episodes_of_another_run_are_refused() -> None:
     for other in ({"slots": 4}, {"shards": 3}, {"train": line}):
         with pytest.raises(SpaceDistError, match="the checkpoint's episodes in progress are not those of a run"):
             RunState.restored(checkpoint, dataclasses.replace(SETUP, **other))
+
+
+def test_what_a_recurrent_policy_remembers_comes_back_and_no_other_size_of_it() -> None:
+    memories = np.random.default_rng(0).normal(size=(2, 3, 8)).astype(np.float32)
+    walk = Walk(4, (1, 6), tuple(
+        dataclasses.replace(unfinished(shard, [5, 0, 3]), memory=memory) for shard, memory in enumerate(memories)
+    ))  # fmt: skip
+    checkpoint = stored(RunState(walk=walk))
+    assert plain(RunState.restored(checkpoint, dataclasses.replace(SETUP, memory_size=8)).walk) == plain(walk)
+    for size in (0, 4):
+        with pytest.raises(SpaceDistError, match="the checkpoint's episodes in progress are not those of a run"):
+            RunState.restored(checkpoint, dataclasses.replace(SETUP, memory_size=size))
+    without = stored(RunState(walk=changed()["walk"]))
+    with pytest.raises(SpaceDistError, match="the checkpoint's episodes in progress are not those of a run"):
+        RunState.restored(without, dataclasses.replace(SETUP, memory_size=8))
+    assert not walk.unfinished[0].same(changed()["walk"].unfinished[0])  # type: ignore[union-attr]
 
 
 def test_what_a_run_commits_is_its_state(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from space_dist import config as configs
 from space_dist.arithmetic import SETTINGS
-from space_dist.config import RunConfig
+from space_dist.config import PPOConfig, RecurrentPPOConfig, RunConfig
 from space_dist.curricula import Selection
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
@@ -184,7 +184,8 @@ def same_selection(one: Selection, other: Selection) -> None:
 @pytest.mark.parametrize("kind", LEARNERS)
 @pytest.mark.parametrize("flat", [True, False])
 def test_spaces_decisions_are_our_loops_for_every_learner(kind: str, flat: bool, tmp_path: Path) -> None:
-    policy = "MlpPolicy" if flat else "MultiInputPolicy"
+    mlp, _, multi_input = (RecurrentPPOConfig if kind == "recurrent_ppo" else PPOConfig).policies
+    policy = mlp if flat else multi_input
     env: dict[str, Any] = {"id": (DISCRETE if kind == "dqn" else LINE) if flat else PARTS}
     env |= {} if flat else {"kwargs": {"discrete": kind == "dqn"}}
     config = run_config(tmp_path, kind, env, SPACE, policy=policy)

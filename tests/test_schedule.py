@@ -33,6 +33,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "ppo": {"learner.learning_rate": 1e-2, "learner.clip_range": 0.4, "curriculum.kappa": 3},
     "a2c": {"learner.learning_rate": 1e-2, "learner.vf_coef": 1.0},
     "trpo": {"learner.learning_rate": 1e-2, "learner.target_kl": 0.1},
+    "recurrent_ppo": {"learner.learning_rate": 1e-2, "learner.n_epochs": 1, "learner.batch_size": 24},
     "dqn": {"learner.learning_rate": 1e-2, "learner.batch_size": 8},
     "sac": {"learner.learning_rate": 1e-2, "learner.gamma": 0.5},
     "td3": {"learner.learning_rate": 1e-2, "learner.gamma": 0.5},

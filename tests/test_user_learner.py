@@ -226,13 +226,15 @@ def test_auto_engine_leaves_it_alone() -> None:
     assert Blueprint.of(stock).config.engine == "population"
 
 
-KINDS = {"ppo": "stable_baselines3", "a2c": "stable_baselines3", "trpo": "sb3_contrib", "sac": "stable_baselines3",
-         "td3": "stable_baselines3"}  # fmt: skip
+KINDS = {"ppo": "stable_baselines3.PPO", "a2c": "stable_baselines3.A2C", "trpo": "sb3_contrib.TRPO",
+         "recurrent_ppo": "sb3_contrib.RecurrentPPO", "sac": "stable_baselines3.SAC",
+         "td3": "stable_baselines3.TD3"}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_class_of_each_kind_that_changes_nothing_has_the_bits_of_the_stock_one(example: Path, kind: str) -> None:
-    (example / "others.py").write_text(f"from {KINDS[kind]} import {kind.upper()}\nclass Mine({kind.upper()}): pass\n")
+    library, name = KINDS[kind].split(".")
+    (example / "others.py").write_text(f"from {library} import {name}\nclass Mine({name}): pass\n")
     found: list[Any] = []
     for own in ("null", "others:Mine"):
         settings = f"learner={{kind: {kind}, import: {own}, n_steps: 256, net_arch: [16]}}"

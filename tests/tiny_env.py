@@ -67,6 +67,27 @@ def make_discrete(n_slots: int) -> Line:
     return Line(n_slots, spaces.Discrete(3))
 
 
+class Glimpsed(Line):
+    """The line, whose target is observed in an episode's first step alone; behind the position, and 0 from then on."""
+
+    def __init__(self, n_slots: int) -> None:
+        super().__init__(n_slots, spaces.Box(-1.0, 1.0, shape=(1,), dtype=np.float32))
+        self.observation_space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
+
+    def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> Observations:
+        position = np.asarray(super().reset(slots, contexts, seeds))
+        return np.concatenate([position, self._target[slots, None].astype(np.float32)], axis=1)
+
+    def step(self, actions: NDArray[np.generic]) -> Step:
+        step = super().step(actions)
+        position = np.asarray(step.observations)
+        return dataclasses.replace(step, observations=np.concatenate([position, np.zeros_like(position)], axis=1))
+
+
+def make_glimpsed(n_slots: int) -> Glimpsed:
+    return Glimpsed(n_slots)
+
+
 class Noting(Line):
     """The line, of which a file in `folder` tells that it is open, and another one that it is closed."""
 

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from space_dist.envs import Observations
 from space_dist.envs.observations import rows
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError
 from space_dist.ledger import Ledger
+from space_dist.rollout.memory import Memory
 from space_dist.rollout.policy import Noise, Policy, policies_of
 from space_dist.run.building import spec_of
 from space_dist.run.launch import policy_of, stored_config
@@ -36,18 +37,21 @@ class ActingPolicy:
     def predict(
         self,
         observation: Observations,
-        state: None = None,  # noqa: ARG002 - those who take any of SB3's policies pass it, and the next one
-        episode_start: object = None,  # noqa: ARG002
+        state: NDArray[np.float32] | None = None,
+        episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[Any], None]:
-        """`(..., obs) -> (..., action)` what to do, and None, as Stable-Baselines3's `predict` has it.
+    ) -> tuple[NDArray[Any], NDArray[np.float32] | None]:
+        """`(..., obs) -> (..., action)` what to do, and the next `state`, as Stable-Baselines3's `predict` has it.
 
         observation: one, or a batch of them; with the scaled context where the run shows it: see `with_context`.
-        deterministic: the likeliest or best action; else one drawn as in training. A policy has no `state`. Raises
-        ConfigError for another shape.
+        state: (n, memory_size) what a recurrent policy remembers of each one's episode, as the call before gave it;
+        None: nothing, and of other policies always. episode_start: (n,) where an episode begins, whatever `state` says.
+        deterministic: the likeliest or best action; else one drawn as in training. Raises ConfigError for another
+        shape.
         """
         batch, single = self._batched(observation)
-        head, outputs = self.policy.head, self.policy.outputs(batch)
+        head, memory = self.policy.head, self._memory(rows(batch), state, episode_start)
+        outputs = memory.outputs(batch)
         if deterministic:
             actions = head.best(outputs)
         else:
@@ -55,7 +59,20 @@ class ActingPolicy:
             noise = Noise.draw(head, self.spec.action_space, self._random, (1, rows(batch)))
             actions = head.sampled(outputs, noise, 0, np.full(rows(batch), np.iinfo(np.int64).max))
         executed = head.executed(actions)
-        return (executed[0] if single else executed), None
+        return (executed[0] if single else executed), memory.values
+
+    def _memory(self, count: int, state: NDArray[np.float32] | None, episode_start: ArrayLike | None) -> Memory:
+        memory = Memory(self.policy, count)
+        if memory.values is not None and state is not None:
+            if np.shape(state) != memory.values.shape:
+                raise ConfigError(
+                    f"the state of {count} observations has the shape {memory.values.shape}, not {np.shape(state)}; "
+                    "hand on what predict gave, or None where all episodes begin"
+                )
+            memory.values[:] = state
+            if episode_start is not None:
+                memory.forget(np.flatnonzero(np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), count)))
+        return memory
 
     def with_context(self, observation: Observations, context: NDArray[Any]) -> Observations:
         """`(..., obs), (..., d)` observations as the run's policy saw them: with the context, if it is shown one.

@@ -19,6 +19,8 @@ class _Learner(Section):
     """Whether updates of several can be computed together (engine: population)."""
     actions: ClassVar[Literal["any", "discrete", "bounded"]] = "any"
     """What it chooses among. bounded: numbers within bounds. any: numbers, with bounds or without, or one of a few."""
+    policies: ClassVar[tuple[str, str, str]] = ("MlpPolicy", "CnnPolicy", "MultiInputPolicy")
+    """SB3's names of its policies: for flat observations, for images, for dictionaries."""
 
     policy: str = Field(default="MlpPolicy", min_length=1, max_length=300)
     """SB3's MlpPolicy (acts in NumPy, without torch), CnnPolicy (images), MultiInputPolicy (dictionaries), or the
@@ -44,10 +46,10 @@ class _Learner(Section):
     @field_validator("policy")
     @classmethod
     def _known_policy(cls, value: str) -> str:
-        known = ("MlpPolicy", "CnnPolicy", "MultiInputPolicy")
-        if value not in known and ":" not in value:
+        if value not in cls.policies and ":" not in value:
             raise ValueError(
-                f"not known{nearest(value, known)} Allowed: {', '.join(known)}, or an import path with a colon"
+                f"not known{nearest(value, cls.policies)} Allowed: {', '.join(cls.policies)}, or an import path with a "
+                "colon"
             )
         return refuse_library(value)
 
@@ -66,6 +68,11 @@ class _Learner(Section):
     def episodes_per_round(self) -> int | None:
         """Episodes that end a round, where steps do not."""
         return None
+
+    @property
+    def memory_size(self) -> int:
+        """How many numbers its policy remembers of an episode that it acts in."""
+        return 0
 
     def policy_settings(self) -> dict[str, Any]:
         """What SB3's policies of this kind are made with, besides layers and their activation."""
@@ -112,14 +119,7 @@ class _OnPolicy(_Learner):
         return {"log_std_init": self.log_std_init}
 
 
-class PPOConfig(_OnPolicy):
-    """Stable-Baselines3 PPO."""
-
-    can_be_stacked: ClassVar[bool] = True
-    kind: Literal["ppo"]
-    """Which learner: PPO."""
-    batch_size: int = Field(default=64, ge=2)
-    """Transitions per minibatch. Source: SB3 (64)."""
+class _Clipped(_OnPolicy):
     n_epochs: int = Field(default=10, ge=1)
     """Passes over each update's transitions. Source: SB3 (10); the paper's PPO2 default is 4."""
     clip_range: float = Field(default=0.2, gt=0.0)
@@ -136,6 +136,16 @@ class PPOConfig(_OnPolicy):
     """What learns from a round in which every reward is 0. learn: the policy as well, as in SB3, though its advantages
     are nothing but the errors of the value function, and normalised to size 1. critic: only the value function (and
     the entropy bonus, if there is one), so that the policy does not drift before it has seen a reward. Source: ours."""
+
+
+class PPOConfig(_Clipped):
+    """Stable-Baselines3 PPO."""
+
+    can_be_stacked: ClassVar[bool] = True
+    kind: Literal["ppo"]
+    """Which learner: PPO."""
+    batch_size: int = Field(default=64, ge=2)
+    """Transitions per minibatch. Source: SB3 (64)."""
     update: Literal["stock", "lean"] = "stock"
     """stock: SB3's own train(). lean: the same minibatches, loss and optimiser in one compiled function, many times
     faster where networks are small, equal but for rounding, and with the same bits on every CPU; MlpPolicy only. Part
@@ -144,6 +154,60 @@ class PPOConfig(_OnPolicy):
     def is_compiled(self, engine: str) -> bool:
         """See `_Learner`."""
         return engine == "population" or self.update == "lean"
+
+
+class RecurrentPPOConfig(_Clipped):
+    """sb3-contrib RecurrentPPO: PPO that remembers what it has seen of an episode, in an LSTM (hidden contexts)."""
+
+    policies: ClassVar[tuple[str, str, str]] = ("MlpLstmPolicy", "CnnLstmPolicy", "MultiInputLstmPolicy")
+    kind: Literal["recurrent_ppo"]
+    """Which learner: RecurrentPPO."""
+    policy: str = Field(default="MlpLstmPolicy", min_length=1, max_length=300)
+    """sb3-contrib's MlpLstmPolicy, CnnLstmPolicy (images), MultiInputLstmPolicy (dictionaries), or the import path of a
+    policy class (my_package.my_module:MyPolicy). All act through torch."""
+    batch_size: int = Field(default=128, ge=2)
+    """Transitions per minibatch: neighbours in time, for the LSTM is trained on stretches of episodes. Source:
+    sb3-contrib."""
+    lstm_hidden_size: int = Field(default=256, ge=1, le=16384)
+    """Units of each layer of an LSTM. `net_arch` is what follows it. Source: sb3-contrib."""
+    n_lstm_layers: int = Field(default=1, ge=1, le=16)
+    """Layers of an LSTM. Source: sb3-contrib."""
+    enable_critic_lstm: bool = True
+    """An LSTM of its own for the critic; false: it sees the present observation alone, unless `shared_lstm`. Source:
+    sb3-contrib."""
+    shared_lstm: bool = False
+    """The critic reads the actor's LSTM, which learns from the actor alone; needs enable_critic_lstm: false. Source:
+    sb3-contrib."""
+
+    @model_validator(mode="after")
+    def _one_lstm_of_the_critic(self) -> Self:
+        if self.shared_lstm and self.enable_critic_lstm:
+            raise ValueError(
+                "shared_lstm: true needs enable_critic_lstm: false: the critic reads the actor's LSTM or one of its own"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _no_minibatch_of_one(self) -> Self:
+        if self.normalize_advantage and self.n_steps % self.batch_size == 1:
+            raise ValueError(
+                f"batch_size = {self.batch_size} leaves one of n_steps = {self.n_steps} transitions for a minibatch of "
+                "its own, and the advantage of one cannot be normalised; use a divisor of n_steps"
+            )
+        return self
+
+    @property
+    def memory_size(self) -> int:
+        """See `_Learner`: hidden and cell state of each layer, of the actor's LSTM and of the critic's own."""
+        return (4 if self.enable_critic_lstm else 2) * self.n_lstm_layers * self.lstm_hidden_size
+
+    def policy_settings(self) -> dict[str, Any]:
+        """See `_Learner`."""
+        return {
+            **super().policy_settings(), "lstm_hidden_size": self.lstm_hidden_size,
+            "n_lstm_layers": self.n_lstm_layers, "shared_lstm": self.shared_lstm,
+            "enable_critic_lstm": self.enable_critic_lstm,
+        }  # fmt: skip
 
 
 class TRPOConfig(_OnPolicy):
@@ -302,7 +366,8 @@ class TD3Config(_OffPolicy):
 
 
 LearnerConfig = Annotated[
-    PPOConfig | TRPOConfig | A2CConfig | DQNConfig | SACConfig | TD3Config, Field(discriminator="kind")
+    PPOConfig | TRPOConfig | A2CConfig | RecurrentPPOConfig | DQNConfig | SACConfig | TD3Config,
+    Field(discriminator="kind"),
 ]
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, Self
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from space_dist.config.curriculum import CurriculumConfig
-from space_dist.config.learner import LearnerConfig, PPOConfig
+from space_dist.config.learner import LearnerConfig, PPOConfig, learners_that
 from space_dist.config.sections import (
     NAME,
     BudgetConfig,
@@ -126,7 +126,7 @@ class RunConfig(Section):
         if self.learner.keeps_next_observations:
             raise ValueError(
                 f"rollout.overlap: true: learner.kind: {self.learner.kind} is off-policy, and learns from older rounds "
-                "anyway; it works with ppo, trpo and a2c"
+                f"anyway; it works with {', '.join(learners_that('has_advantages'))}"
             )
         if self.learner.normalize_observations or self.learner.normalize_rewards:
             raise ValueError(

@@ -92,8 +92,8 @@ class RolloutConfig(Section):
     one state (PointMass)."""
     overlap: bool = False
     """Collect a round while the update on the one before it runs, with the weights from before that update: for slow
-    environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO and A2C
-    without normalisation. Source: ours."""
+    environments on rollout actors. Only the first round of an iteration waits for its selection. PPO, TRPO, A2C and
+    RecurrentPPO without normalisation. Source: ours."""
 
     @model_validator(mode="before")
     @classmethod

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from space_dist.config import (
     LearnerConfig,
     PPOConfig,
+    RecurrentPPOConfig,
     RunConfig,
     TRPOConfig,
     ValueDisagreementConfig,
@@ -33,6 +34,7 @@ from space_dist.learner.off_policy import OFF_POLICY, OffPolicyLearner
 from space_dist.learner.on_policy import OnPolicyLearner
 from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
 from space_dist.learner.population import refuse as refuse_population
+from space_dist.learner.recurrent import RecurrentLearner
 from space_dist.learner.uncompiled import stand_in
 
 stand_in()  # before the first optimiser
@@ -65,7 +67,8 @@ def make_learner(
     if config.keeps_next_observations:
         learner = OFF_POLICY[type(config)]
         return learner(config, observation_space, action_space, seed=seed, total_steps=total_steps)
-    return OnPolicyLearner(
+    kind = RecurrentLearner if isinstance(config, RecurrentPPOConfig) else OnPolicyLearner
+    return kind(
         config, observation_space, action_space,
         seed=seed, n_slots=n_slots, slot_length=slot_length, total_steps=total_steps,
     )  # fmt: skip

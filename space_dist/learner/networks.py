@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,8 +23,8 @@ from space_dist.errors import ConfigError
 from space_dist.rollout.policy import Array, Head, Layers, Statistics
 from space_dist.system.importing import load
 
-ALGORITHMS: dict[str, Any] = {  # by kind: SB3's name in small letters
-    name.lower(): found
+ALGORITHMS: dict[str, Any] = {  # by kind: SB3's name in small letters, RecurrentPPO's in two words
+    re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower(): found
     for library in (sb3_contrib, stable_baselines3)
     for name in library.__all__
     if isinstance(found := getattr(library, name), type) and issubclass(found, BaseAlgorithm)
@@ -62,24 +63,25 @@ def policy_class(config: LearnerConfig) -> str | type[BasePolicy]:
 
 def refuse_policy(config: LearnerConfig, observation_space: spaces.Space[Any]) -> None:
     """Raise ConfigError if SB3 cannot build this policy for these observations."""
-    found, base = policy_class(config), ALGORITHMS[config.kind].policy_aliases["MlpPolicy"]
+    mlp, cnn, multi_input = config.policies
+    found, base = policy_class(config), ALGORITHMS[config.kind].policy_aliases[mlp]
     if not isinstance(found, str):
         if not issubclass(found, base):
             raise ConfigError(f"learner.policy {config.policy!r} is no policy of {config.kind}: no {base.__name__}")
         return
     parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
     flat = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
-    if found == "MlpPolicy" and not flat:
+    if found == mlp and not flat:
         raise ConfigError(
-            f"learner.policy: MlpPolicy needs flat observations (a one-dimensional Box), not {observation_space}; "
-            "CnnPolicy takes images, MultiInputPolicy dictionaries"
+            f"learner.policy: {mlp} needs flat observations (a one-dimensional Box), not {observation_space}; "
+            f"{cnn} takes images, {multi_input} dictionaries"
         )
-    if (found == "MultiInputPolicy") != isinstance(observation_space, spaces.Dict):
-        raise ConfigError(f"learner.policy: dictionaries need MultiInputPolicy, and nothing else: {observation_space}")
+    if (found == multi_input) != isinstance(observation_space, spaces.Dict):
+        raise ConfigError(f"learner.policy: dictionaries need {multi_input}, and nothing else: {observation_space}")
     for name, part in parts.items():
         image = is_image_space(part)
-        if found == "CnnPolicy" and not image:
-            raise ConfigError(f"learner.policy: CnnPolicy needs images (uint8, 0 to 255), not {part}")
+        if found == cnn and not image:
+            raise ConfigError(f"learner.policy: {cnn} needs images (uint8, 0 to 255), not {part}")
         ordered = isinstance(part, spaces.Box) and image and is_image_space_channels_first(part)
         if image and (not ordered or min((part.shape or (0,))[-2:]) < _LEAST_IMAGE):
             what = f"part {name!r} of the observations" if name else "observations"
@@ -128,7 +130,7 @@ class TorchPolicy:
 
     def outputs(self, observations: Observations) -> Array:
         """See `policy.Policy`."""
-        network: Any = _network(self)
+        network: Any = network_of(self)
         with torch.no_grad():
             inputs = tensors(self.statistics.scaled(observations))
             if self.head.kind == "greedy":
@@ -147,7 +149,7 @@ class TorchPolicy:
 
     def values(self, observations: Observations) -> NDArray[np.float64]:
         """See `policy.Policy`."""
-        network: Any = _network(self)
+        network: Any = network_of(self)
         with torch.no_grad():
             inputs = tensors(self.statistics.scaled(observations))
             if isinstance(network, ActorCriticPolicy):
@@ -176,7 +178,7 @@ def torch_policy(
 _BUILT: dict[str, tuple[Mapping[str, Any], BasePolicy]] = {}  # by what it is made of: the last state, and the network
 
 
-def _network(policy: TorchPolicy) -> BasePolicy:
+def network_of(policy: TorchPolicy) -> BasePolicy:
     """SB3's policy object with these weights; built once per process."""
     key = f"{policy.config.model_dump_json()} {policy.observation_space} {policy.action_space}"
     if key not in _BUILT:

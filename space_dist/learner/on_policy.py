@@ -1,4 +1,4 @@
-"""PPO, TRPO and A2C: one round is one rollout buffer."""
+"""PPO, TRPO, A2C and, with `recurrent`, RecurrentPPO: one round is one rollout buffer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from space_dist.rollout import Shard
 from space_dist.rollout.policy import Head, MlpPolicy, Statistics
 
 _OURS = {
-    "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation", "log_std_init",
+    "kind", "policy", "n_steps", "learning_rate", "learning_rate_schedule", "net_arch", "activation",
     "normalize_observations", "normalize_rewards", "unrewarded", "update", "import_path", "kwargs",
 }  # fmt: skip
 
@@ -44,6 +44,20 @@ class Joined:
     rewards: NDArray[np.float32]
     ended: NDArray[np.bool_]
     starts: NDArray[np.bool_]
+
+    @property
+    def episode_starts(self) -> NDArray[np.bool_]:
+        """(length, slots) whether an episode begins with this step."""
+        return np.concatenate([self.starts[None], self.ended[:-1]])
+
+    def flat(self, action_space: spaces.Space[Any]) -> tuple[Observations, torch.Tensor]:
+        """`(length * slots, ...)` observations, and actions as SB3's policies judge them."""
+        count = self.rewards.size
+        actions = torch.as_tensor(self.actions.reshape(count, -1).astype(np.float32))
+        if isinstance(action_space, spaces.Discrete):
+            # As SB3's `train()` does: its buffer keeps numbers of actions as floats.
+            actions = actions.long().flatten()
+        return each(lambda array: array.reshape(count, *array.shape[2:]), self.observations), actions
 
 
 def leaves_policy(config: LearnerConfig, shards: Sequence[Shard]) -> bool:
@@ -76,7 +90,8 @@ class OnPolicyLearner(SB3Learner):
 
     def _build(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> OnPolicyAlgorithm:
         config = self._settings
-        settings = {name: value for name, value in dict(config).items() if name not in _OURS}
+        ours = _OURS | {*config.policy_settings()}
+        settings = {name: value for name, value in dict(config).items() if name not in ours}
         if "max_grad_norm" in settings and settings["max_grad_norm"] is None:
             # SB3 clips in any case: an infinite norm clips nothing.
             settings["max_grad_norm"] = float("inf")
@@ -146,28 +161,25 @@ class OnPolicyLearner(SB3Learner):
         on is bootstrapped from the value of its last observation.
         """
         buffer, joined = self.model.rollout_buffer, self.joined(shards)
-        observations, actions, rewards, ended = joined.observations, joined.actions, joined.rewards, joined.ended
+        rewards, ended = joined.rewards, joined.ended
         length, n_slots = rewards.shape
+        beyond = [shard.truncated_observations for shard in shards]
+        beyond.append(concatenate([shard.last_observations for shard in shards]))
+        buffer.reset()
         with torch.no_grad():
-            flat = each(lambda array: array.reshape(length * n_slots, *array.shape[2:]), observations)
-            flat_actions = torch.as_tensor(actions.reshape(length * n_slots, -1).astype(np.float32))
-            if isinstance(self.model.action_space, spaces.Discrete):
-                # As SB3's `train()` does: its buffer keeps numbers of actions as floats.
-                flat_actions = flat_actions.long().flatten()
-            beyond = [shard.truncated_observations for shard in shards]
-            beyond.append(concatenate([shard.last_observations for shard in shards]))
-            values, log_probs, (*behind, last_values) = self._evaluated(flat, flat_actions, beyond)
+            values, log_probs, (*behind, last_values) = self._evaluated(
+                shards, joined, [self.statistics.scaled(others) for others in beyond]
+            )
         first = 0
         for shard, after in zip(shards, behind, strict=True):
             if len(after):
                 mine = np.argwhere(shard.truncated)
                 rewards[mine[:, 0], mine[:, 1] + first] += self.model.gamma * after
             first += shard.rewards.shape[1]
-        buffer.reset()
-        put(buffer.observations, slice(None), observations)
-        buffer.actions[:] = actions.reshape(buffer.actions.shape)
+        put(buffer.observations, slice(None), joined.observations)
+        buffer.actions[:] = joined.actions.reshape(buffer.actions.shape)
         buffer.rewards[:] = rewards
-        buffer.episode_starts[:] = np.concatenate([joined.starts[None], ended[:-1]])
+        buffer.episode_starts[:] = joined.episode_starts
         buffer.values[:] = values.reshape(length, n_slots)
         buffer.log_probs[:] = log_probs.reshape(length, n_slots)
         # SB3's `get` refuses a buffer that is not full.
@@ -188,19 +200,23 @@ class OnPolicyLearner(SB3Learner):
         )
 
     def _evaluated(
-        self, observations: Observations, actions: torch.Tensor, beyond: Sequence[Observations]
+        self,
+        shards: Sequence[Shard],  # noqa: ARG002 - of a recurrent policy they hold more
+        joined: Joined,
+        beyond: Sequence[Observations],
     ) -> tuple[Values, Values, list[Values]]:
-        """`(n,), (n,)` values, and log-probabilities of (n, ...) actions, as the update that follows computes them.
+        """`(n,), (n,)` values and log-probabilities of all steps' actions, as the update that follows computes them.
 
-        observations: at the scales that acted.  beyond: others, whose (k,) values are wanted as well.
+        beyond: observations behind each shard's truncated steps, then behind the last of all slots, at the scales that
+            acted, whose (k,) values are wanted as well.
         """
-        scaled = [self.statistics.scaled(others) for others in beyond]
+        observations, actions = joined.flat(self.model.action_space)
         if isinstance(self.model, LeanPPO) and not isinstance(observations, dict):
-            return self._evaluated_at_once(self.model, [observations, *scaled], actions.numpy())
+            return self._evaluated_at_once(self.model, [observations, *beyond], actions.numpy())
         found, likelihoods, _ = self.model.policy.evaluate_actions(tensors(observations), actions)
         values = [
             self.model.policy.predict_values(tensors(others)).numpy()[:, 0] if rows(others) else np.zeros(0, np.float32)
-            for others in scaled
+            for others in beyond
         ]
         return found.numpy(), likelihoods.numpy(), values
 

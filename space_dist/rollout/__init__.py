@@ -2,7 +2,8 @@
 
 A round is a fixed number of steps, and episodes go on across rounds: what a shard leaves unfinished is part of its
 answer, and of the question that the next round asks. Whoever still has these very episodes in its environment goes on
-at once; anybody else plays the recorded actions again, which the contract of environments makes exact.
+at once; anybody else plays the recorded actions again, which the contract of environments makes exact. What a recurrent
+policy remembers of them goes with them: it was seen with earlier weights, and cannot be made again.
 
 A rollout actor imports neither torch nor Stable-Baselines3, unless the policy it is sent does. The number of shards,
 the slots of a shard and the size of every chunk are fixed by the config: whoever computes a piece of work, and how

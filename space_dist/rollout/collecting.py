@@ -12,7 +12,8 @@ from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, Observations, Step
 from space_dist.envs.observations import allocate, concatenate, put, take
 from space_dist.errors import SpaceDistError
-from space_dist.rollout.policy import Noise, Policy, batched
+from space_dist.rollout.memory import Memory
+from space_dist.rollout.policy import Array, Noise, Policy, batched
 from space_dist.rollout.table import Episodes, EpisodeTable
 from space_dist.rollout.walk import FloatArray, IntArray, Unfinished, Walking
 from space_dist.seeding import Purpose, generator
@@ -30,6 +31,7 @@ class Shard:
         `np.argwhere(truncated)`.
     next_observations: (length, slots, ...) behind every step, if asked for: replay buffers need them.
     begun: how many episodes were begun.  unfinished: what runs on.
+    memory: (slots, memory_size) what a recurrent policy remembered before the first step; None of others.
     """
 
     shard: int
@@ -49,6 +51,7 @@ class Shard:
     episodes: Episodes
     begun: int
     unfinished: Unfinished
+    memory: Array | None = None
 
     @property
     def steps(self) -> int:
@@ -131,15 +134,16 @@ class _Recording:
 
     def shards(
         self, rollouts: Sequence[Rollout], table: EpisodeTable, begun: IntArray, starts: NDArray[np.bool_],
-        current: Observations,
+        current: Observations, remembered: Array | None, memory: Array | None,
     ) -> list[Shard]:  # fmt: skip
         """What was recorded, one shard for each rollout: copies, for one shard would keep the arrays of all alive.
 
         begun: (len(rollouts),) episodes.  starts, current: (n_slots, ...) as in `Shard`, where they are split up.
+        remembered, memory: (n_slots, memory_size) before the first step and behind the last, of a recurrent policy.
         """
         length, stored, count = len(self._stored), np.stack(self._stored), len(rollouts)
         slots = self._rewards.shape[1] // count
-        episodes, unfinished = table.episodes(count), table.unfinished(count, np.stack(self._executed))
+        episodes, unfinished = table.episodes(count), table.unfinished(count, np.stack(self._executed), memory)
         lasts = concatenate(self._truncated_observations)
         owners = np.nonzero(self._truncated[:length])[1] // slots  # of each last observation
         shards = []
@@ -156,6 +160,7 @@ class _Recording:
                     last_observations=take(current, own), truncated_observations=take(lasts, owners == index),
                     next_observations=None if self._next is None else take(self._next, mine),
                     episodes=episodes[index], begun=int(begun[index]), unfinished=unfinished[index],
+                    memory=None if remembered is None else remembered[own].copy(),
                 )
             )  # fmt: skip
         return shards
@@ -183,6 +188,9 @@ def collect(
     live = stage.resume([rollout.unfinished for rollout in rollouts])
     current = live if live is not None else replayed(env, table)
     starts = ~table.runs  # now: the table goes on with the round
+    memory = Memory(acting, env.n_slots)
+    memory.recall([rollout.unfinished for rollout in rollouts], slots)
+    remembered = memory.values
     ended = np.flatnonzero(starts)
     for time in range(length):
         if len(ended):
@@ -191,7 +199,8 @@ def collect(
             ids, contexts, seeds = walking.next(ended)
             put(current, ended, env.reset(ended, contexts, seeds))
             table.begin(ended, ids, contexts, seeds, time)
-        stored = acting.head.sampled(acting.outputs(current), noise, time, first_steps + time * slots)
+            memory.forget(ended)
+        stored = acting.head.sampled(memory.outputs(current), noise, time, first_steps + time * slots)
         executed = acting.head.executed(stored)
         step = env.step(executed)
         ended = recording.add(time, current, stored, executed, step)
@@ -202,7 +211,7 @@ def collect(
         # Behind an episode's end this is void: `recording` has kept what is truncated, and a reset comes first.
         put(current, slice(None), step.observations)
 
-    shards = recording.shards(rollouts, table, walking.begun, starts, current)
+    shards = recording.shards(rollouts, table, walking.begun, starts, current, remembered, memory.values)
     stage.leave([shard.unfinished for shard in shards], current)
     return shards
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from space_dist.envs import BatchedEnv
 from space_dist.envs.observations import put, take
 from space_dist.rollout.collecting import endless
+from space_dist.rollout.memory import Memory
 from space_dist.rollout.policy import Noise, Policy, batched
 from space_dist.rollout.walk import FloatArray, IntArray
 
@@ -72,13 +73,14 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
     gamma = np.repeat([trial.gamma for trial in trials], count)
     # Copied: what an environment returns may be its own memory.
     observations = take(env.reset(slots, contexts, seeds), slice(None))
+    memory = Memory(acting, n_slots)
     alive = np.ones(n_slots, dtype=np.bool_)
     returns, discounted, success = np.zeros(n_slots), np.zeros(n_slots), np.full(n_slots, np.nan)
     lengths, backward = np.zeros(n_slots, dtype=np.int64), np.zeros(n_slots)
     discount, time = np.ones(n_slots), 0
     trained = np.full(n_slots, np.iinfo(np.int64).max)  # behind every warm-up and schedule of exploration
     while alive.any():
-        outputs = acting.outputs(observations)
+        outputs = memory.outputs(observations)
         chosen = acting.head.best(outputs) if noise is None else acting.head.sampled(outputs, noise, time, trained)
         step = env.step(acting.head.executed(chosen))
         # Horner's rule for the released code's metric, sum r_t gamma^(T-1-t).
@@ -97,6 +99,7 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
         put(observations, slice(None), step.observations)
         if len(ended) and alive.any():  # every slot must be steppable; what follows in these is not counted
             put(observations, ended, env.reset(ended, contexts[ended], seeds[ended]))
+            memory.forget(ended)
     return [
         Outcomes(trial.policy.version, returns[mine], discounted[mine], lengths[mine], success[mine], backward[mine])
         for index, trial in enumerate(trials)

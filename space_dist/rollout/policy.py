@@ -1,7 +1,8 @@
 """Policies as actors see them: act on observations, and say what a state is worth. NumPy only.
 
 The multilayer perceptrons of Stable-Baselines3's learners are evaluated here without torch. Anything else (CNNs,
-dictionary observations, a user's own policy) comes from `learner` as another `Policy`, which acts through torch.
+dictionary observations, a user's own policy) comes from `learner` as another `Policy`, which acts through torch. What
+recurrent ones have seen of an episode is kept beside them (`memory`).
 """
 
 from __future__ import annotations

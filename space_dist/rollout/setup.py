@@ -40,6 +40,7 @@ class Setup:
     episodes_per_round: int | None = None  # a round ends with this many episodes instead of with its slots' length
     keep_next_observations: bool = False
     given: Mapping[str, bytes] = field(default_factory=dict)  # by other runs: `RunConfig.given_paths`
+    memory_size: int = 0  # numbers that a policy remembers of an episode: 0 unless it is recurrent
     policies: int = 1  # policies; each has an equal share of the shards, and of the parts of an evaluation
 
     def instances(self, split: Split) -> InstanceSet:

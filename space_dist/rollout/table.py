@@ -109,8 +109,13 @@ class EpisodeTable:
             for mine in [owner == index]
         ]
 
-    def unfinished(self, owners: int, executed: NDArray[np.generic]) -> list[Unfinished]:
-        """Every owner's own that run on, after the actions `executed` (length, n_slots, ...) of this round."""
+    def unfinished(
+        self, owners: int, executed: NDArray[np.generic], memory: NDArray[np.float32] | None = None
+    ) -> list[Unfinished]:  # fmt: skip
+        """Every owner's own that run on, after the actions `executed` (length, n_slots, ...) of this round.
+
+        memory: (n_slots, memory_size) what their policy remembers, if it is recurrent.
+        """
         runs, time = self.runs, len(executed)
         lengths = np.where(runs, self.lengths(time), 0)
         actions = np.concatenate([self.actions, executed]) if len(self.actions) else executed
@@ -131,6 +136,7 @@ class EpisodeTable:
                     discounted_returns=np.where(running, self._discounted[mine], 0.0),
                     discounts=np.where(running, self._discount[mine], 0.0),
                     actions=actions[len(actions) - steps :, mine].copy(),
+                    memory=None if memory is None else np.where(running[:, None], memory[mine], np.float32(0.0)),
                 )
             )  # fmt: skip
         return found

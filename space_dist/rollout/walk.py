@@ -27,6 +27,7 @@ class Unfinished:
     returns, discounted_returns: (slots,) sums of rewards so far.  discounts: (slots,) gamma^length.
     actions: (lengths.max(), slots, ...) as the environment was given them. The last row is everybody's last step; rows
         before an episode's first step are 0.
+    memory: (slots, memory_size) what a recurrent policy remembers of each, by the weights that saw it; None of others.
     """
 
     ids: IntArray
@@ -37,12 +38,16 @@ class Unfinished:
     discounted_returns: FloatArray
     discounts: FloatArray
     actions: NDArray[np.generic]
+    memory: NDArray[np.float32] | None = None
 
     def same(self, other: Unfinished | None) -> bool:
         """Whether both are the same to the bit."""
-        return other is not None and all(
+        if other is None or (self.memory is None) != (other.memory is None):
+            return False
+        return all(
             one.shape == two.shape and one.dtype == two.dtype and one.tobytes() == two.tobytes()
             for one, two in zip(vars(self).values(), vars(other).values(), strict=True)
+            if one is not None
         )
 
 
@@ -151,22 +156,27 @@ def stacked(walk: Walk) -> dict[str, NDArray[Any]]:
     def padded(actions: NDArray[np.generic]) -> NDArray[np.generic]:
         return np.concatenate([np.zeros((length - len(actions), *actions.shape[1:]), actions.dtype), actions])
 
-    names = [field.name for field in dataclasses.fields(Unfinished) if field.name != "actions"]
+    names = [name for name, column in vars(unfinished[0]).items() if name != "actions" and column is not None]
     arrays = {name: np.stack([getattr(one, name) for one in unfinished]) for name in names}
     return {**arrays, "actions": np.stack([padded(one.actions) for one in unfinished])}
 
 
 def unstacked(
     arrays: Mapping[str, NDArray[Any]], *, shards: int, slots: int, features: int, horizon: int,
-    action_shape: tuple[int, ...],
+    action_shape: tuple[int, ...], memory_size: int = 0,
 ) -> tuple[Unfinished, ...]:  # fmt: skip
-    """The inverse of `stacked`. Raises SpaceDistError for anything that cannot be a run's of these numbers."""
+    """The inverse of `stacked`. Raises SpaceDistError for anything that cannot be a run's of these numbers.
+
+    memory_size: of its policy, for each slot; 0: it is not recurrent.
+    """
     each = (shards, slots)
     shapes = {
         "ids": ("int64", each), "contexts": ("float64", (*each, features)), "seeds": ("uint64", each),
         "lengths": ("int64", each), "returns": ("float64", each), "discounted_returns": ("float64", each),
         "discounts": ("float64", each),
     }  # fmt: skip
+    if memory_size:
+        shapes["memory"] = ("float32", (*each, memory_size))
     fit = arrays.keys() == {*shapes, "actions"} and all(
         (arrays[name].dtype.name, arrays[name].shape) == expected for name, expected in shapes.items()
     )

@@ -119,6 +119,7 @@ class Blueprint:
             test=test,
             episodes_per_round=config.n_episodes,
             keep_next_observations=config.learner.keeps_next_observations,
+            memory_size=config.learner.memory_size,
             policies=config.n_policies,
             given=self.given,
         )

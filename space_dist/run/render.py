@@ -37,6 +37,7 @@ from space_dist.errors import ConfigError, LedgerError
 from space_dist.instances import InstanceSet, read_csv
 from space_dist.ledger import Ledger
 from space_dist.rollout import Split
+from space_dist.rollout.memory import Memory
 from space_dist.rollout.policy import Policy, policies_of
 from space_dist.run.launch import policy_of
 from space_dist.seeding import Purpose, episode_seeds
@@ -216,9 +217,10 @@ class Gallery:
         seen: list[NDArray[Any]] = []
         total, success = 0.0, None
         look(over=False)
+        memory = Memory(self._policy, 1)
         for _ in range(env.horizon):
             head = self._policy.head
-            step = env.step(head.executed(head.best(self._policy.outputs(observations))))
+            step = env.step(head.executed(head.best(memory.outputs(observations))))
             observations = take(step.observations, slice(None))
             total += float(step.rewards[0])
             success = None if step.success is None else bool(step.success[0])

@@ -43,6 +43,7 @@ def _walk_in(name: str, checkpoint: Checkpoint, setup: Setup) -> Walk:
         unstacked(
             checkpoint.under("unfinished/"), shards=setup.shards, slots=setup.slots, features=len(setup.train.names),
             horizon=setup.spec.horizon, action_shape=setup.spec.action_space.shape or (),
+            memory_size=setup.memory_size,
         ),
     )  # fmt: skip
 

@@ -62,6 +62,10 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "trpo": ("pointmass_space", [*_SHORT, _TRPO]),
     "trpo population": ("pointmass_space", [*_SHORT, _TRPO, "engine=population"]),
     "a2c": ("pointmass_space", [*_SHORT, "learner={kind: a2c, n_steps: 128}"]),
+    "recurrent_ppo": ("curricula/pointmass_plr", [
+        *_SHORT, "env.context_visible=false",
+        "learner={kind: recurrent_ppo, n_steps: 128, n_epochs: 2, net_arch: [16], lstm_hidden_size: 24}",
+    ]),
     "dqn": ("cartpole_dqn_space", [
         "budget.steps=1000", "budget.episodes=20", "learner.learning_starts=200", "learner.net_arch=[32, 32]",
         "tracking.uri=null", "evaluation.episodes=1", "resources.workers=0",
