@@ -316,7 +316,7 @@ class EdgeConfig(_OutcomeSection):
     """Which curriculum: the edge of what the policy can do."""
     memory: float = Field(default=0.9, ge=0.0, lt=1.0)
     """Share of the remembered outcomes that an iteration leaves. Source: ours."""
-    width: float = Field(default=0.15, ge=0.0)
+    width: float = Field(default=0.1, ge=0.0)
     """How far outcomes speak for their neighbours: standard deviation of a normal kernel, in widths of the contexts'
     bounds; 0: not at all. Source: ours."""
     strength: float = Field(default=4.0, ge=0.0)
