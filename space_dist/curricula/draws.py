@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from space_dist.curricula.interface import (
 )
 from space_dist.instances import InstanceSet
 from space_dist.seeding import Purpose, generator
+
+Outcome = Literal["success", "return"]
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,13 @@ def needed_episodes(feedback: Feedback, curriculum: str) -> Episodes:
     if feedback.episodes is None:
         raise ValueError(f"{curriculum} needs the iteration's episodes")
     return feedback.episodes
+
+
+def outcomes(episodes: Episodes, outcome: Outcome, lowest: float, largest: float) -> FloatArray:
+    """`(m,)` what episodes count as, in [0, 1]: their success, or their return, from `lowest` (0) to `largest` (1)."""
+    if outcome == "success":
+        return episodes.success
+    return np.clip((episodes.returns - lowest) / (largest - lowest), 0.0, 1.0)
 
 
 def distinct(feedback: Feedback) -> int:

@@ -19,15 +19,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from space_dist.curricula.draws import Drawn, DrawnState, Draws, needed_episodes, uniform
-from space_dist.curricula.interface import Episodes, Feedback, FloatArray, IntArray, Numbers, Selection, Wants
+from space_dist.curricula.draws import Drawn, DrawnState, Draws, Outcome, needed_episodes, outcomes, uniform
+from space_dist.curricula.interface import Feedback, FloatArray, IntArray, Numbers, Selection, Wants
 from space_dist.instances import ContextBounds, InstanceSet
 
-Outcome = Literal["success", "return"]
 REMEMBERED: Final = 1e-3  # of an episode: less is forgotten
 _CHUNK: Final = 1 << 22  # distances computed at once
 _RIDGE: Final = (0.1, 1.0)  # precisions of the prior of intercept and slope, per standard deviation of the values
@@ -74,9 +73,9 @@ class Edge(Drawn):
     def step(self, state: EdgeState, feedback: Feedback) -> tuple[EdgeState, Selection, Numbers]:
         """The five lines of the module."""
         episodes = needed_episodes(feedback, "edge")
-        outcomes = self._outcomes(episodes)
-        won = remembered(state.won, self._memory, episodes.indices, outcomes)
-        lost = remembered(state.lost, self._memory, episodes.indices, 1.0 - outcomes)
+        came_of = outcomes(episodes, self._outcome, self._lowest, self._largest)
+        won = remembered(state.won, self._memory, episodes.indices, came_of)
+        lost = remembered(state.lost, self._memory, episodes.indices, 1.0 - came_of)
         near_won, near_lost = neighbours(self._places, self._width, won, lost)
         expected = critics_word(feedback.values_after, won, lost)
         successes, failures = self._strength * expected + near_won, self._strength * (1.0 - expected) + near_lost
@@ -91,12 +90,6 @@ class Edge(Drawn):
             "largest_edge": float(edges.max()),
         }
         return new, self.selection(new), numbers
-
-    def _outcomes(self, episodes: Episodes) -> FloatArray:
-        """`(m,)` in [0, 1]."""
-        if self._outcome == "success":
-            return episodes.success
-        return np.clip((episodes.returns - self._lowest) / (self._largest - self._lowest), 0.0, 1.0)
 
 
 def remembered(before: FloatArray, memory: float, indices: IntArray, new: FloatArray) -> FloatArray:

@@ -10,14 +10,12 @@ so nothing is probed; docs/curricula.md ("Learning progress") says what follows 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from space_dist.curricula.draws import Drawn, DrawnState, Draws, needed_episodes, uniform
+from space_dist.curricula.draws import Drawn, DrawnState, Draws, Outcome, needed_episodes, outcomes, uniform
 from space_dist.curricula.interface import (
     BoolArray,
-    Episodes,
     Feedback,
     FloatArray,
     Numbers,
@@ -26,7 +24,6 @@ from space_dist.curricula.interface import (
 )
 from space_dist.instances import InstanceSet
 
-Outcome = Literal["success", "return"]
 UNKNOWN_WEIGHT = 0.5  # of an instance that was never played: that of mean progress
 
 
@@ -73,7 +70,9 @@ class LearningProgress(Drawn):
         episodes = needed_episodes(feedback, "learning progress")
         n = len(self._instances)
         counts = np.bincount(episodes.indices, minlength=n)
-        sums = np.bincount(episodes.indices, weights=self._outcomes(episodes), minlength=n)
+        sums = np.bincount(
+            episodes.indices, weights=outcomes(episodes, self._outcome, self._lowest, self._largest), minlength=n
+        )
         now, rates = counts > 0, sums / np.maximum(counts, 1)
         fast = averaged(state.fast, rates, now, state.played, self._smoothing)
         slow = averaged(state.slow, fast, now, state.played, self._smoothing)
@@ -89,12 +88,6 @@ class LearningProgress(Drawn):
             "largest_progress": float(progress.max()),
         }
         return new, self.selection(new), numbers
-
-    def _outcomes(self, episodes: Episodes) -> FloatArray:
-        """`(m,)` in [0, 1]."""
-        if self._outcome == "success":
-            return episodes.success
-        return np.clip((episodes.returns - self._lowest) / (self._largest - self._lowest), 0.0, 1.0)
 
 
 def averaged(
