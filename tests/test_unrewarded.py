@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from space_dist.config import RecurrentPPOConfig
 from space_dist.rollout import Shard
 from tests.test_learner import DISCRETE_LINE, LINE, bits, learner_for, shards_of, small
 from tests.test_population_learner import stacked
@@ -54,3 +55,26 @@ def test_the_entropy_bonus_goes_on_without_a_reward() -> None:
     learner.update(rewardless(shards_of(learner)), round=0, steps=96)
     assert bits(learner)["log_std"] != before["log_std"]
     assert float(learner.model.policy.log_std.detach().max()) > 0.0
+
+
+def test_what_was_learned_before_is_carried_over_by_momentum_alone() -> None:
+    """Behind a rewarded round Adam's moments are not 0: the policy goes on a little, and less than if it learned."""
+    moved = {}
+    for unrewarded in ("learn", "critic"):
+        learner = learner_for(small(unrewarded=unrewarded))
+        learner.update(shards_of(learner), round=0, steps=96)
+        before = learner.model.policy.action_net.weight.detach().clone()
+        learner.update(rewardless(shards_of(learner, round=1)), round=1, steps=192)
+        moved[unrewarded] = float((learner.model.policy.action_net.weight.detach() - before).abs().sum())
+    assert 0.0 < moved["critic"] < moved["learn"]
+
+
+def test_a_recurrent_policy_learns_nothing_without_a_reward() -> None:
+    settings = {"kind": "recurrent_ppo", "net_arch": (8,), "n_steps": 96, "batch_size": 32, "n_epochs": 1}
+    learner = learner_for(RecurrentPPOConfig(**settings, lstm_hidden_size=4, unrewarded="critic"))
+    before = bits(learner)
+    learner.update(rewardless(shards_of(learner)), round=0, steps=96)
+    after = bits(learner)
+    for name, _ in learner.model.policy.named_parameters():
+        of_critic = "value_net" in name or "critic" in name
+        assert (after[name] != before[name]) == of_critic, name

@@ -134,8 +134,9 @@ class _Clipped(_OnPolicy):
     """Stop an update's epochs early at 1.5 times this divergence; null: never. Source: SB3."""
     unrewarded: Literal["learn", "critic"] = "learn"
     """What learns from a round in which every reward is 0. learn: the policy as well, as in SB3, though its advantages
-    are nothing but the errors of the value function, and normalised to size 1. critic: only the value function (and
-    the entropy bonus, if there is one), so that the policy does not drift before it has seen a reward. Source: ours."""
+    are nothing but the errors of the value function, and normalised to size 1. critic: only the value function, so that
+    the policy does not drift before it has seen a reward. What still moves it: the entropy bonus, what Adam's momentum
+    carries over from rounds before, and layers that it shares with the value function (images). Source: ours."""
 
 
 class PPOConfig(_Clipped):

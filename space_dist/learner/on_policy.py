@@ -63,7 +63,7 @@ class Joined:
 def leaves_policy(config: LearnerConfig, shards: Sequence[Shard]) -> bool:
     """Whether a round shall teach the value function only: nothing in it was rewarded (`learner.unrewarded`).
 
-    Without advantages the policy's loss has no gradient; what the value function is fitted to stays.
+    Without advantages the policy's own loss has no gradient; what the value function is fitted to stays.
     """
     return getattr(config, "unrewarded", "learn") == "critic" and not any(shard.rewards.any() for shard in shards)
 
