@@ -66,3 +66,14 @@ def test_bimodal_gates_are_narrow_and_on_both_sides() -> None:
     assert 0.4 < (contexts[:, 0] > 0).mean() < 0.6
     assert {*contexts[:, 1]} == {0.5}
     assert contexts[:, 2].min() < 0.2 < 3.8 < contexts[:, 2].max()
+
+
+def test_half_of_mixed_gates_are_bimodal_and_the_others_anywhere() -> None:
+    train, test = sample("pointmass_mixed", 400, 100, 0)
+    contexts = np.vstack((train.contexts, test.contexts))
+    narrow = contexts[:, 1] == 0.5
+    assert 0.4 < narrow.mean() < 0.6
+    assert {*contexts[narrow, 0]} == {-3.0, 3.0}
+    anywhere = contexts[~narrow]
+    assert anywhere[:, 0].min() < -3.5 < 3.5 < anywhere[:, 0].max()
+    assert anywhere[:, 1].min() < 1.0 < 7.0 < anywhere[:, 1].max()

@@ -28,12 +28,24 @@ def _draw_bimodal(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
     return np.column_stack((gate_x, np.full(n, GATE_WIDTH), friction))
 
 
+def _draw_mixed(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """Each uniform within the bounds or bimodal, as likely."""
+    anywhere = rng.random(n) < 0.5
+    return np.where(anywhere[:, None], rng.uniform(BOUNDS.low, BOUNDS.high, size=(n, 3)), _draw_bimodal(rng, n))
+
+
 DISTRIBUTIONS: Final = {
     "pointmass_bimodal": Distribution(
         description="PointMass, a gate of width 0.5 at x = -3 or x = 3, each as likely; friction uniform",
         source="after Klink et al. 2022 (CURROT), whose target has gates at both sides; that friction varies is ours",
         bounds=BOUNDS,
         draw=_draw_bimodal,
+    ),
+    "pointmass_mixed": Distribution(
+        description="PointMass, each gate uniform within the bounds or bimodal, as likely",
+        source="ours: narrow gates alone are found by no policy that starts from nothing",
+        bounds=BOUNDS,
+        draw=_draw_mixed,
     ),
 }
 
