@@ -8,12 +8,9 @@ A claim whose grid was not run, or only in small, gets no verdict.
 
 from __future__ import annotations
 
-import csv
-import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Final, Literal
@@ -22,12 +19,11 @@ import space_dist  # noqa: F401 - before NumPy, whose settings it makes
 
 # isort: split
 import numpy as np
-from numpy.typing import NDArray
+from kept import SAME, Artefact, Cell, Measure, put_between
 
-from space_dist.report.outcomes import area, paired_difference
+from space_dist.report.outcomes import paired_difference
 from space_dist.report.statistics import (
     Interval,
-    estimate,
     paired_ratio,
     probability_of_improvement,
     restricted,
@@ -35,15 +31,11 @@ from space_dist.report.statistics import (
     steps_to_threshold,
 )
 from space_dist.report.tables import interval_text, number_text
-from space_dist.system.files import atomic_write
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 PAGE: Final = ROOT / "docs/results.md"
 BEGIN, END = "<!-- claims: made by jobs/claims.py -->", "<!-- end of claims -->"
-SAME: Final = 0.05  # of what the baseline learned
 
-FloatArray = NDArray[np.float64]
-Measure = Literal["early", "final"]
 Verdict = Literal["holds", "holds in part", "does not hold here", "not tested at full scale"]
 
 
@@ -54,69 +46,6 @@ class Part:
     text: str
     seen: bool
     contradicted: bool = False
-
-
-class Cell:
-    """One cell's finished runs, as `seeds.csv` has them."""
-
-    def __init__(self, label: str, curves: Mapping[int, tuple[NDArray[np.int64], FloatArray]], budget: int) -> None:
-        self.label, self.curves, self.budget = label, curves, budget
-
-    def values(self, measure: Measure, at: int | None = None) -> dict[int, float]:
-        """By seed: the mean over training, or the return at a step (the last evaluation up to it); None: at the end."""
-        found = {}
-        for seed, (steps, returns) in self.curves.items():
-            if measure == "early":
-                found[seed] = area(steps, returns, self.budget)
-            else:
-                found[seed] = float(returns[-1 if at is None else np.searchsorted(steps, at, side="right") - 1])
-        return found
-
-    def iqm(self, measure: Measure = "final", at: int | None = None) -> Interval:
-        """Over seeds."""
-        return estimate(np.array([*self.values(measure, at).values()])).iqm
-
-    @cached_property
-    def learned(self) -> float:
-        """Final less first IQM."""
-        first = estimate(np.array([returns[0] for _, returns in self.curves.values()])).iqm
-        return self.iqm().value - first.value
-
-
-class Artefact:
-    """The folder of a grid in docs/results."""
-
-    def __init__(self, name: str) -> None:
-        self.folder = ROOT / "docs/results" / name
-        self.provenance = json.loads((self.folder / "provenance.json").read_text())
-        curves: dict[str, dict[int, list[tuple[int, float]]]] = {}
-        for row in self.rows("seeds.csv"):
-            seeds = curves.setdefault(row["label"], {})
-            seeds.setdefault(int(row["seed"]), []).append((int(row["steps"]), float(row["test_return"])))
-        last = max(points[-1][0] for seeds in curves.values() for points in seeds.values())  # of the longest run
-        self.cells = {
-            label: Cell(
-                label,
-                {seed: (np.array([step for step, _ in points]), np.array([value for _, value in points]))
-                 for seed, points in seeds.items()},
-                last,
-            )
-            for label, seeds in curves.items()
-        }  # fmt: skip
-
-    @property
-    def whole(self) -> bool:
-        """Whether all seeds and steps of the grid were run."""
-        return bool(self.provenance["scale"] == 1.0)
-
-    def rows(self, name: str) -> list[dict[str, str]]:
-        """A CSV file's."""
-        with (self.folder / name).open(newline="") as file:
-            return list(csv.DictReader(file))
-
-    def row(self, name: str, label: str) -> dict[str, str]:
-        """Of a cell."""
-        return next(row for row in self.rows(name) if row["label"] == label)
 
 
 # ---- words ----------------------------------------------------------------------------------------------------------
@@ -438,7 +367,7 @@ def table() -> str:
     for name, (grid, claim) in CLAIMS.items():
         if not (ROOT / "docs/results" / grid / "provenance.json").exists():
             continue
-        found = Artefact(grid)
+        found = Artefact(ROOT / "docs/results" / grid)
         parts = claim(found)
         told = "; ".join(part.text + (" ✓" if part.seen else " ✗" if part.contradicted else "") for part in parts)
         lines.append(f"| [{name}](results/{grid}/report.md) | {told} | *{verdict(parts, whole=found.whole)}* |")
@@ -451,10 +380,7 @@ def main() -> int:
     if sys.argv[1:] != ["--write"]:
         print(made)
         return 0
-    text = PAGE.read_text()
-    before, _, rest = text.partition(BEGIN)
-    after = rest.partition(END)[2]
-    atomic_write(PAGE, f"{before}{BEGIN}\n\n{made}\n\n{END}{after}".encode())
+    put_between(PAGE, BEGIN, END, made)
     return 0
 
 

@@ -1,9 +1,11 @@
-"""The paper's artefacts: `make results NAME=pointmass_uniform` runs one grid of configs/paper and keeps what it shows.
+"""Artefacts: `make results NAME=pointmass_uniform` runs one grid of configs/paper and keeps what it shows.
+
+`NAME=wins` is every grid of configs/wins (docs/wins.md), `NAME=wins/gates` one of them, `NAME=all` all there are.
 
 Into docs/results/NAME go the report, its numbers in full precision as CSV, its figures, and `provenance.json`: the
 command, the commit, the arithmetic, and how much was run. Run again anywhere, the numbers are the same, byte for byte.
 What is done already is skipped; killed and started again, it goes on. `--scale 0.02` makes everything in small, in
-folders of its own, and says so on every figure. `all` is every grid, one after the other.
+folders of its own, and says so on every figure.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from space_dist.system.processes import collect_seldom
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIDS = ROOT / "configs/paper"
+WINS = ROOT / "configs/wins"
 KEPT = (
     "report.md",
     "cells.csv",
@@ -38,26 +41,29 @@ KEPT = (
 
 
 def results(
-    name: Annotated[str, typer.Argument(help="A grid of configs/paper: pointmass_uniform, maze, ...; or all.")],
+    name: Annotated[str, typer.Argument(help="pointmass_uniform, ... of configs/paper; wins, wins/gates, ...; all.")],
     scale: Annotated[float, typer.Option(help="Share of the grid's seeds and steps.")] = 1.0,
     root: Annotated[Path, typer.Option(help="Folder that holds the grids' folders.")] = ROOT / "runs",
     out: Annotated[Path, typer.Option(help="Folder of what is kept.")] = ROOT / "docs/results",
 ) -> None:
-    """Run a grid of the paper, report on it, and keep the report with what it takes to make it again."""
-    known = sorted(path.stem for path in GRIDS.glob("*.yaml"))
-    if name != "all" and name not in known:
-        raise ConfigError(f"{name!r} is no grid of the paper{nearest(name, known)} Allowed: all, {', '.join(known)}")
-    for one in known if name == "all" else [name]:
-        code = _keep(one, scale, root, out)
+    """Run grids, report on each, and keep the report with what it takes to make it again."""
+    known = {path.stem: path for path in sorted(GRIDS.glob("*.yaml"))}
+    known |= {f"wins/{path.stem}": path for path in sorted(WINS.glob("*.yaml"))}
+    chosen = {one: path for one, path in known.items() if name in (one, "all", one.rpartition("/")[0])}
+    if not chosen:
+        allowed = ["all", "wins", *known]
+        raise ConfigError(f"{name!r} is no artefact{nearest(name, allowed)} Allowed: {', '.join(allowed)}")
+    for one, path in chosen.items():
+        code = _keep(one, path, scale, root, out)
         if code:
             raise typer.Exit(code)
 
 
-def _keep(name: str, scale: float, root: Path, out: Path) -> int:
+def _keep(name: str, path: Path, scale: float, root: Path, out: Path) -> int:
     from space_dist.api.grids import frozen
     from space_dist.report import build_grid_report
 
-    grid, manifest = frozen(GRIDS / f"{name}.yaml", root.absolute(), scale)
+    grid, manifest = frozen(path, root.absolute(), scale)
     say(f"{name}: {len(manifest.cells)} cells x {len(manifest.seeds)} seeds")
     if code := tell(manifest, grid, run_frozen(grid, manifest)):
         return code
@@ -66,9 +72,9 @@ def _keep(name: str, scale: float, root: Path, out: Path) -> int:
     if folder.exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
-    for path in sorted(report.folder.iterdir()):
-        if path.name in KEPT or path.suffix == ".png":
-            shutil.copyfile(path, folder / path.name)
+    for made in sorted(report.folder.iterdir()):
+        if made.name in KEPT or made.suffix == ".png":
+            shutil.copyfile(made, folder / made.name)
     told = f"make results NAME={name}" + ("" if scale == 1.0 else f" SCALE={scale:g}")
     atomic_write(folder / "provenance.json", json.dumps(_provenance(told, grid, manifest), indent=1).encode() + b"\n")
     say(f"{name}: {folder}")

@@ -182,8 +182,11 @@ def test_a_claim_is_judged_by_the_rules_of_the_page(
     Kept(tmp_path, name).curves(finals)
     grid, parts = claims.CLAIMS[claim]
     assert grid == name
-    assert claims.verdict(parts(claims.Artefact(name)), whole=True) == verdict
-    assert claims.verdict(parts(claims.Artefact(name)), whole=False) == "not tested at full scale"
+    assert claims.verdict(parts(claims.Artefact(tmp_path / "docs/results" / name)), whole=True) == verdict
+    assert (
+        claims.verdict(parts(claims.Artefact(tmp_path / "docs/results" / name)), whole=False)
+        == "not tested at full scale"
+    )
 
 
 @pytest.mark.parametrize(("least", "most", "other", "verdict"), [
@@ -197,7 +200,9 @@ def test_curricula_of_ant_are_judged_by_their_agreement(
     kept.csv("curricula.csv", {
         label: {"tau_with_others_least": low, "tau_with_others_most": high} for label, (low, high) in taus.items()
     })  # fmt: skip
-    assert claims.verdict(claims.CLAIMS["C15"][1](claims.Artefact("ant")), whole=True) == verdict
+    assert (
+        claims.verdict(claims.CLAIMS["C15"][1](claims.Artefact(tmp_path / "docs/results/ant")), whole=True) == verdict
+    )
 
 
 def load_job(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
@@ -206,6 +211,7 @@ def load_job(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, spec.name, module)  # where dataclasses look
+    monkeypatch.syspath_prepend(str(ROOT / "jobs"))
     spec.loader.exec_module(module)
     return module
 
@@ -217,6 +223,7 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     settings = {**TINY, **write_line_instances(tmp_path), "evaluation.episodes": 2}
     write_grid(tmp_path, name="tiny", set=settings, seeds=[0, 1]).rename(tmp_path / "tiny.yaml")
     monkeypatch.setattr(module, "GRIDS", tmp_path)
+    monkeypatch.setattr(module, "WINS", tmp_path / "none")
     return module
 
 
@@ -253,7 +260,7 @@ def test_what_is_kept_is_made_anew(job: Any, tmp_path: Path) -> None:
 
 
 def test_an_unknown_artefact_is_one_sentence(job: Any, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"'tini' is no grid of the paper; did you mean 'tiny'[?]"):
+    with pytest.raises(ConfigError, match=r"'tini' is no artefact; did you mean 'tiny'[?]"):
         job.results("tini", 1.0, tmp_path / "runs", tmp_path / "out")
     done = subprocess.run(
         [sys.executable, ROOT / "jobs/results.py", "cartpol"], cwd=ROOT, capture_output=True, text=True,

@@ -76,14 +76,16 @@ def run_grid(
     root: Path | str | None = None,
     max_parallel: int | None = None,
     scale: float = scaling.WHOLE,
+    overrides: Sequence[str] = (),
     progress: bool | Callable[[Overview], None] = True,
 ) -> GridRun:
     """Work through a grid on this machine, as `space-dist grid run` does: what is done is skipped.
 
     grid: its YAML file, `shipped:NAME`, its folder, or its manifest.json.  root: the folder that holds grids' folders;
     None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  scale: the
-    share of a YAML file's seeds and steps, in a folder of its own (`<name>-scale-<scale>`).  progress: show a line that
-    changes in its place; or what is called now and then.
+    share of a YAML file's seeds and steps, in a folder of its own (`<name>-scale-<scale>`).  overrides:
+    `KEY=VALUE` for every cell of a YAML file, in a folder of its own (`<name>-set-<digest>`).  progress: show a line
+    that changes in its place; or what is called now and then.
 
     Runs that fail are noted (`GridRun.statuses`) and raise nothing. Raises ConfigError for every fault of the files,
     LedgerError if the folder cannot be written.
@@ -93,7 +95,7 @@ def run_grid(
     named = grid.folder if isinstance(grid, Grid | GridRun) else Path(grid)
     stop = StopRequests()
     with WarmPlaces(max_parallel) as warm, shown(progress is True) as show:
-        place, manifest = frozen(named, base, scale)
+        place, manifest = frozen(named, base, scale, overrides)
 
         def observe(overview: Overview) -> None:
             if callable(progress):
@@ -107,13 +109,15 @@ def run_grid(
     return GridRun(place.folder)
 
 
-def frozen(path: Path, root: Path, scale: float = scaling.WHOLE) -> tuple[Grid, Manifest]:
+def frozen(
+    path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()
+) -> tuple[Grid, Manifest]:  # fmt: skip
     """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere.
 
-    scale: the share of the seeds and steps in YAML.
+    scale: the share of the seeds and steps in YAML. changes: `KEY=VALUE` for every cell of it.
     """
     if path.is_dir() or path.name == MANIFEST:
-        source = find_grid(path, root, scale)
+        source = find_grid(path, root, scale, changes)
         place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
         manifest = place.manifest()
         if manifest.search is not None:
@@ -121,7 +125,7 @@ def frozen(path: Path, root: Path, scale: float = scaling.WHOLE) -> tuple[Grid, 
         return place, manifest
     from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
 
-    made = plan(path, root, scale)
+    made = plan(path, root, scale, changes)
     return made.grid, made.manifest
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 import typer
 
 from space_dist.cli.overview import display, print_cells, print_failures, status_json, summary, tell, workers_in_words
-from space_dist.cli.terminal import STOP, Json, console, delivered, one_of, output_left, say, warn
+from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile
@@ -73,13 +73,15 @@ _UNFINISHED = 3  # the exit code of `grid status` where runs are still to be don
 
 
 @grid_app.command("plan")
-def grid_plan(grid: GridPath, root: Root = None, scale: Scale = 1.0, as_json: Json = False) -> None:
+def grid_plan(
+    grid: GridPath, root: Root = None, scale: Scale = 1.0, changes: Changes = None, as_json: Json = False
+) -> None:  # fmt: skip
     """Check a grid, print its cells and what is done already, and freeze its manifest."""
     from space_dist.experiment.status import run_statuses
     from space_dist.grid.planning import plan
     from space_dist.system.provenance import code_digest
 
-    made = plan(grid, root_of(root), scale)
+    made = plan(grid, root_of(root), scale, changes or ())
     manifest = made.manifest
     found = run_statuses(made.grid, manifest, code_digest())
     done = [run_status for run_status in found if run_status.condition == "done"]
@@ -112,9 +114,13 @@ def _of(count: int, what: str) -> str:
 
 @grid_app.command("run")
 def grid_run(
-    grid: GridPath,
+    grids: Annotated[
+        list[Path],
+        typer.Argument(metavar="GRID...", help="YAML files of grids, their folders, or their manifest.json."),
+    ],
     root: Root = None,
     scale: Scale = 1.0,
+    changes: Changes = None,
     max_parallel: MaxParallel = None,
     address: Address = "local",
     mode: ClusterMode = "auto",
@@ -126,24 +132,36 @@ def grid_run(
         typer.Option("--runs", help="Refuse a manifest whose runs have another digest than this one."),
     ] = None,
 ) -> None:
-    """Work through a grid: skip what is done, go on with what is not, retry by cause."""
+    """Work through a grid, or one after the other: skip what is done, go on with what is not, retry by cause."""
     chosen = mode_of(mode)
+    if len(grids) > 1 and (part is not None or digest is not None):
+        raise ConfigError(f"--part and --runs are of one grid, and here are {len(grids)}")
     prepare(address)
+    codes = []
     with started_ahead(address, chosen, max_parallel) as warm:
         from space_dist.api.grids import frozen
 
-        place, manifest = frozen(grid, root_of(root), scale)
+        all_frozen = [frozen(grid, root_of(root), scale, changes or ()) for grid in grids]
+        [place, manifest], *others = all_frozen
+        if others and len({one.folder for one, _ in all_frozen}) < len(all_frozen):
+            raise ConfigError(f"of {', '.join(map(str, grids))} two are one grid; name each once")
         if digest is not None and digest != manifest.runs_digest:
             raise ConfigError(
-                f"{grid} holds other runs (digest {manifest.runs_digest}) than those this was written for ({digest}): "
-                "export the grid again, and submit that"
+                f"{grids[0]} holds other runs (digest {manifest.runs_digest}) than those this was written for "
+                f"({digest}): export the grid again, and submit that"
             )
         if stop_file is not None:
             STOP.watch(stop_file, manifest.resources.grace_seconds)
         found = run_frozen(
             place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part, warm=warm
         )  # fmt: skip
-    raise typer.Exit(tell(manifest, place, found))
+    codes.append(tell(manifest, place, found))
+    for place, manifest in others:
+        if STOP.reason() is not None:
+            break
+        found = run_frozen(place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes)
+        codes.append(tell(manifest, place, found))
+    raise typer.Exit(next((code for code in codes if code), 0))
 
 
 @grid_app.command("submit")
@@ -152,6 +170,7 @@ def grid_submit(
     address: Annotated[str, typer.Option(help="The cluster's job server, like http://127.0.0.1:8265.")],
     root: Root = None,
     scale: Scale = 1.0,
+    changes: Changes = None,
     max_in_flight: Annotated[
         str, typer.Option(help="Runs at a time: auto (as many as there are CPUs for), or a number.")
     ] = "auto",
@@ -174,7 +193,7 @@ def grid_submit(
     chosen = mode_of(mode)
     limit = None if max_in_flight == "auto" else _number(max_in_flight, "--max-in-flight")
     base = root_of(root)
-    place, manifest = frozen(grid, base, scale)
+    place, manifest = frozen(grid, base, scale, changes or ())
     remote = Remote(address, manifest, base)
     job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
     say(f"{manifest.name}: conducted by job {job} at {address}")
@@ -197,6 +216,7 @@ def grid_status(
     grid: GridPath,
     root: Root = None,
     scale: Scale = 1.0,
+    changes: Changes = None,
     watch: Annotated[bool, typer.Option("--watch", help="Go on showing until nothing is left to do.")] = False,
     as_json: Json = False,
     by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
@@ -206,7 +226,7 @@ def grid_status(
     from space_dist.experiment.status import exit_code
     from space_dist.slurm.queue import WatchedQueue
 
-    place, manifest = _found(grid, root, scale)
+    place, manifest = _found(grid, root, scale, changes or ())
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
     watched = WatchedQueue(place.folder)
@@ -399,11 +419,13 @@ def root_of(root: Path | None) -> Path:
     return workplace() / "runs" if root is None else lasting(root, "--root")
 
 
-def _found(path: Path, root: Path | None, scale: float = 1.0) -> tuple[Grid, Manifest]:
+def _found(
+    path: Path, root: Path | None, scale: float = 1.0, changes: Sequence[str] = ()
+) -> tuple[Grid, Manifest]:  # fmt: skip
     """A grid that was frozen before, however the user names it."""
     from space_dist.experiment.manifest import find_grid
 
-    place = find_grid(path, root_of(root), scale)
+    place = find_grid(path, root_of(root), scale, changes)
     return place, place.manifest()
 
 

@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -192,6 +192,10 @@ def report(
         typer.Option(help="Of a grid's YAML file: folder that holds the grids' folders, as of `space-dist grid`."),
     ] = None,
     scale: Annotated[float, typer.Option(help="Of a grid's YAML file: the scale at which it was run.")] = 1.0,
+    changes: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--set", metavar="KEY=VALUE", help="Of a grid's YAML file: with what it was run. Repeatable."),
+    ] = None,
 ) -> None:
     """Compare runs, or the cells of a grid: figures and tables with 95 % intervals over seeds."""
     from space_dist.api.reports import is_grid
@@ -201,7 +205,7 @@ def report(
 
     paths = [located(path) for path in paths]
     if len(paths) == 1 and is_grid(paths[0]):
-        grid = _grid(paths[0], root, scale)
+        grid = _grid(paths[0], root, scale, changes or ())
         print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
         return
     if baseline is not None and (absent := [str(path) for path in paths if not path.exists()]):
@@ -209,16 +213,16 @@ def report(
         raise ConfigError(f"{absent[0]} does not exist; a label of several words goes in quotes: --baseline '{label}'")
     if grids := [path for path in paths if is_grid(path)]:
         raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
-    if baseline is not None or threshold is not None or scale != 1.0:
-        raise ConfigError(f"--baseline, --threshold and --scale are for grids; {paths[0]} is none")
+    if baseline is not None or threshold is not None or scale != 1.0 or changes:
+        raise ConfigError(f"--baseline, --threshold, --scale and --set are for grids; {paths[0]} is none")
     print_report(build_report(find_ledgers(paths), Path("report") if out is None else out), console)
 
 
-def _grid(path: Path, root: Path | None, scale: float) -> Grid:
+def _grid(path: Path, root: Path | None, scale: float, changes: Sequence[str]) -> Grid:
     from space_dist.experiment.manifest import find_grid
     from space_dist.system.workplace import workplace
 
-    return find_grid(path, workplace() / "runs" if root is None else root, scale)
+    return find_grid(path, workplace() / "runs" if root is None else root, scale, changes)
 
 
 def print_report(result: Report, to: Console) -> None:

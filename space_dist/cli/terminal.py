@@ -121,6 +121,16 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Override a config key, e.g. budget.steps=20000. Repeatable."),
 ]
 
+Changes = Annotated[
+    Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Of a YAML file: a config key of every cell, like instances.train=mine.csv, in a folder of its own, "
+        "NAME-set-DIGEST. Repeatable.",
+    ),
+]
+
 Kwargs = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time
     typer.Option(

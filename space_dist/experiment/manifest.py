@@ -15,6 +15,7 @@ import hashlib
 import itertools
 import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,6 +121,8 @@ class GridConfig(Section):
     baseline: dict[str, Any] = Field(default={})
     """What reports compare with: the cell that has all these keys and values; none: the first round robin cell, else
     the first cell."""
+    threshold: float | None = Field(default=None, allow_inf_nan=False)
+    """Steps to this test return are reported; none: to the baseline's final IQM."""
 
     @field_validator("extends", mode="before")
     @classmethod
@@ -194,10 +197,14 @@ def _matches(point: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
     return all(point[key] == value for key, value in entry.items())
 
 
-def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[str, Any]]]]:
+def load_grid(
+    path: Path, changes: Sequence[str] = ()
+) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[str, Any]]]]:
     """A grid file, checked: the grid, and for each cell its settings by axis and its run config as plain data.
 
-    Relative paths in the grid file are relative to it. Raises ConfigError with file and key of every fault.
+    Relative paths in the grid file are relative to it. changes: `KEY=VALUE` for every cell, after all that the file
+    says; relative paths in them are relative to the current folder. Raises ConfigError with file and key of every
+    fault, and for a change of what the grid compares.
     """
     place = configs.located(path)
     data = configs.read_yaml(place)
@@ -205,6 +212,7 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
         raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
     _refuse_search(data, path)
     grid = configs.check(GridConfig, data, str(path))
+    _refuse_changes(grid, changes)
     folder = place.absolute().parent
     bases = {base: configs.read(Path(configs.beside(base, folder))) for base in grid.extends}
     n_runs = len(grid.seed_list())
@@ -220,12 +228,29 @@ def load_grid(path: Path) -> tuple[GridConfig, list[tuple[dict[str, Any], dict[s
                     continue
                 here = configs.from_folder(key, value, folder)
                 configs.put(data, key, json.loads(json.dumps(here)), key)
+            for change in changes:
+                configs.apply_override(data, change)
             cells.append((point, data))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     if not cells:
         raise ConfigError(f"{path}: exclude leaves no cell")
     return grid, cells
+
+
+def _refuse_changes(grid: GridConfig, changes: Sequence[str]) -> None:
+    """Raise ConfigError for changes of what cells differ in, and of what is the grid's own."""
+    for change in changes:
+        key = change.partition("=")[0].strip()
+        head = key.partition(".")[0]
+        if head in _NOT_OF_A_GRID:
+            own = _NOT_OF_A_GRID[head]
+            raise ConfigError(f"{configs.told(change)}: {own!r} is the grid's own; change it in a copy of the file")
+        for axis in grid.axes():
+            if f"{key}.".startswith(f"{axis}.") or f"{axis}.".startswith(f"{key}."):
+                raise ConfigError(
+                    f"{configs.told(change)}: cells of this grid differ in {axis}; change it in a copy of the file"
+                )
 
 
 def _refuse_search(data: Mapping[str, Any], path: Path) -> None:
@@ -321,7 +346,9 @@ class Manifest:
 
     axes: config keys in which cells differ. baseline: id of the cell that reports compare with. code, git: the version
     of this package that froze it. instances: file name in the grid's `instances` folder -> SHA-256 of its content.
-    scale: the share of the grid's seeds and steps that this is. search: of a grid that grows, trial by trial.
+    scale: the share of the grid's seeds and steps that this is. changes: `KEY=VALUE`, what every cell has otherwise
+    than the grid's file. threshold: the test return to which reports count steps; None: the baseline's final one.
+    search: of a grid that grows, trial by trial.
     """
 
     name: str
@@ -336,6 +363,8 @@ class Manifest:
     code: str
     git: Mapping[str, str]
     scale: float = scaling.WHOLE
+    changes: tuple[str, ...] = ()
+    threshold: float | None = None
     search: Search | None = None
 
     def runs(self) -> list[Run]:
@@ -404,6 +433,8 @@ class Manifest:
             "tracking": self.tracking.model_dump(),
             "baseline": self.baseline, "instances": dict(self.instances), "code": self.code, "git": dict(self.git),
             **({} if self.scale == scaling.WHOLE else {"scale": self.scale}),
+            **({"changes": list(self.changes)} if self.changes else {}),
+            **({} if self.threshold is None else {"threshold": self.threshold}),
             **({} if self.search is None else {"search": self.search.to_json()}),
         }  # fmt: skip
         data["sha256"] = _sha256(data)
@@ -424,8 +455,8 @@ class Manifest:
             known: dict[str, type[Section]] = {"resources": RunResources, "retry": Retry, "tracking": GridTracking}
             sections: dict[str, Any] = {key: model.model_validate(data.pop(key)) for key, model in known.items()}
             manifest = cls(
-                cells=cells, axes=tuple(data.pop("axes")), seeds=tuple(data.pop("seeds")), search=search, **sections,
-                **data,
+                cells=cells, axes=tuple(data.pop("axes")), seeds=tuple(data.pop("seeds")), search=search,
+                changes=tuple(data.pop("changes", ())), **sections, **data,
             )  # fmt: skip
             names = (manifest.name, *manifest.instances)
             if not all(re.fullmatch(NAME, name) for name in names) or not all(_CELL_ID.fullmatch(c.id) for c in cells):
@@ -529,17 +560,19 @@ class Grid:
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")
 
 
-def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
+def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()) -> Grid:
     """The grid that a user names: its folder, its manifest.json, its name below `root`, or its YAML file (frozen below
-    `root`, at a scale).
+    `root`, at a scale and with changes).
 
-    Raises ConfigError if there is nothing of the kind, and for a scale of what is frozen already; LedgerError if a YAML
-    file's grid was never frozen.
+    Raises ConfigError if there is nothing of the kind, and for a scale or changes of what is frozen already;
+    LedgerError if a YAML file's grid was never frozen.
     """
     if not path.exists() and len(path.parts) == 1 and Grid(root / path).manifest_file.exists():
         path = root / path
     if scale != scaling.WHOLE and (path.is_dir() or path.name == MANIFEST):
         raise ConfigError(f"{path} is frozen already, with its seeds and steps; --scale is for a grid's YAML file")
+    if changes and (path.is_dir() or path.name == MANIFEST):
+        raise ConfigError(f"{path} is frozen already, with its settings; --set is for a grid's YAML file")
     if path.is_dir():
         if not (path / MANIFEST).exists():
             raise LedgerError(f"{path} holds no grid: it has no {MANIFEST}")
@@ -549,9 +582,10 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE) -> Grid:
     data = configs.read_yaml(configs.located(path))
     _refuse_search(data, path)
     config = configs.check(GridConfig, data, str(path))
-    grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale)))
+    grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale), changes))
     if not grid.manifest_file.exists():
         small = "" if scale == scaling.WHOLE else f" --scale {scale:g}"
+        small += "".join(f" --set {shlex.quote(change)}" for change in changes)
         raise LedgerError(
             f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}{small}` freezes it there "
             "(--root names another root)"

@@ -1,7 +1,8 @@
-"""A grid in small: fewer seeds and fewer steps, so that a large one can be tried, and says everywhere that it was."""
+"""A grid otherwise than its file has it: fewer seeds and fewer steps, or other settings; it always says so."""
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -20,9 +21,14 @@ def checked(scale: float) -> float:
     return scale
 
 
-def name_of(name: str, scale: float) -> str:
-    """The name of a grid in small: never that of the whole one, whose folder and results are others."""
-    return name if scale == WHOLE else f"{name}-scale-{scale:g}"
+def name_of(name: str, scale: float, changes: Sequence[str] = ()) -> str:
+    """The name of a grid in small, or with other settings: never that of its file, whose folder and results are others.
+
+    changes: `KEY=VALUE`, in any order; the same ones give the same name.
+    """
+    told = "\n".join(sorted(changes))
+    changed = f"{name}-set-{hashlib.sha256(told.encode()).hexdigest()[:8]}" if changes else name
+    return changed if scale == WHOLE else f"{changed}-scale-{scale:g}"
 
 
 def fewer(seeds: Sequence[int], scale: float) -> tuple[int, ...]:

@@ -42,14 +42,16 @@ class Plan:
     dropped_runs: int
 
 
-def plan(path: Path, root: Path, scale: float = scaling.WHOLE) -> Plan:
-    """Resolve and check a grid file, and freeze it in `<root>/<name>`, or a share of its seeds and steps beside that.
+def plan(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()) -> Plan:
+    """Resolve and check a grid file, and freeze it in `<root>/<name>`; beside that, a share of its seeds and steps, or
+    what it is with `changes` (`KEY=VALUE`) to every cell.
 
     A grid that was frozen before is frozen anew: runs of cells that are still there keep their results. Raises
     ConfigError for every fault of the files, and if somebody is working on another version of the grid now.
     """
-    config, points = load_grid(path)
-    name, seeds = scaling.name_of(config.name, scaling.checked(scale)), scaling.fewer(config.seed_list(), scale)
+    config, points = load_grid(path, changes)
+    name = scaling.name_of(config.name, scaling.checked(scale), changes)
+    seeds = scaling.fewer(config.seed_list(), scale)
     grid = Grid(root.absolute() / name)
     files = InstanceFiles()
     specs: dict[str, EnvironmentSpec] = {}  # by the section of a config: an environment is looked at once
@@ -58,7 +60,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE) -> Plan:
     for point, data in points:
         label = label_of(point, config.axes())
         where = f"{path}, cell {label!r}"
-        resolved = scaling.shorter(resolved_cell(config.name, label, data, where), scale, where)
+        resolved = scaling.shorter(resolved_cell(config.name, label, data, where, changes), scale, where)
         cell, run_steps = frozen_cell(config.resources, resolved, point, label, where, files, specs)
         if cell.id in cells:
             raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
@@ -70,7 +72,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE) -> Plan:
         tracking=settled(config.tracking, name),
         baseline=_baseline(path, config, list(cells.values())),
         instances={name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.contents.items())},
-        code=code_digest(), git=git_state(), scale=scale,
+        code=code_digest(), git=git_state(), scale=scale, changes=tuple(sorted(changes)), threshold=config.threshold,
     )  # fmt: skip
     before = freeze(grid, manifest, files.contents)
     now, then = ({run.key for run in one.runs()} if one else set[str]() for one in (manifest, before))
@@ -106,13 +108,19 @@ class InstanceFiles:
         return self._names[id(instances)]
 
 
-def resolved_cell(grid: str, label: str, data: dict[str, Any], where: str) -> RunConfig:
-    """The run config of a cell of this grid, checked; `where` names it in errors. Raises ConfigError."""
+def resolved_cell(
+    grid: str, label: str, data: dict[str, Any], where: str, changes: Sequence[str] = ()
+) -> RunConfig:  # fmt: skip
+    """The run config of a cell of this grid, checked; `where` names it in errors, and so do the `changes` made to it.
+
+    Raises ConfigError.
+    """
     for key in ("tracking", "resources", "seed"):  # the grid's own
         data.pop(key, None)
     # The name of a run may become a file's.
     name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid}_{label}")[:100]
-    return configs.parse({**data, "name": name}, where)
+    origins = {change.partition("=")[0].strip(): configs.told(change) for change in changes}
+    return configs.parse({**data, "name": name}, where, origins)
 
 
 def frozen_cell(

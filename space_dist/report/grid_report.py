@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -116,9 +117,9 @@ def build_grid_report(
     """Report on a grid as it stands, finished or not; `out` is by default `report` in the grid's folder.
 
     baseline: label of a cell, or the start of its id; None: the manifest's. threshold: a test return; None: the
-    baseline's final IQM. in_depth: look at curricula and at each instance as well, which takes seconds. Raises
-    ConfigError for an unknown baseline, a threshold that is no finite number, or if `out` cannot be written to;
-    LedgerError if the manifest is missing or damaged.
+    manifest's, else the baseline's final IQM. in_depth: look at curricula and at each instance as well, which takes
+    seconds. Raises ConfigError for an unknown baseline, a threshold that is no finite number, or if `out` cannot be
+    written to; LedgerError if the manifest is missing or damaged.
     """
     if threshold is not None and not math.isfinite(threshold):
         raise ConfigError(f"--threshold must be a finite number, not {threshold}")
@@ -129,17 +130,18 @@ def build_grid_report(
     folder = grid.folder / "report" if out is None else out
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)  # before the work, which takes a while for a large grid
+    asked = manifest.threshold if threshold is None else threshold
     cells = read_cells(grid, manifest)
     reference = next((cell for cell in cells if cell.cell.id == chosen), None)
     if reference is None:
         raise ConfigError(f"{grid.manifest_file} names a baseline {chosen!r} that is none of its cells")
-    compared = compare(cells, reference, threshold)
+    compared = compare(cells, reference, asked)
     measures = measured(cells, compared)
     analysed = cells[:MAX_ANALYSED] if in_depth else []
     curricula = curricula_of(analysed)
     note = scaling.in_words(manifest.scale, len(manifest.seeds))
 
-    summary = _summary(manifest, cells, reference, compared, threshold)
+    summary = _summary(manifest, cells, reference, compared, asked)
     remarks = _remarks(manifest, cells, compared)
     finals = _finals(cells, compared, measures)
     sections = [
@@ -221,6 +223,9 @@ def _summary(
         sentences.append(
             f"A grid in small, {scaling.in_words(manifest.scale, len(manifest.seeds))}: no evidence for the whole one."
         )
+    if manifest.changes:
+        told = " ".join(f"--set {shlex.quote(change)}" for change in manifest.changes)
+        sentences.append(f"Not as the grid's file has it: {told}.")
     level = compared[cells.index(baseline)].threshold
     others = len({cell.task for cell in cells}) > 1
     counterparts = "; in other environments or test sets, its counterpart there" if others else ""

@@ -1,0 +1,162 @@
+"""Grids with other settings than their file has: `--set` for every cell, several grids in one command, a threshold."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from space_dist.api.grids import run_grid
+from space_dist.errors import ConfigError, LedgerError
+from space_dist.experiment.manifest import Manifest, find_grid
+from space_dist.grid.planning import plan
+from space_dist.report import build_grid_report
+from tests.commanding import command
+from tests.grids import TINY, write_grid, write_line_instances
+
+
+def test_a_change_is_of_every_cell_and_in_a_folder_of_its_own(tmp_path: Path) -> None:
+    path = write_grid(tmp_path)
+    asis, changed = plan(path, tmp_path / "runs"), plan(path, tmp_path / "runs", 1.0, ["learner.gamma=0.5"])
+    assert asis.grid.folder != changed.grid.folder
+    assert changed.manifest.name.startswith(f"{asis.manifest.name}-set-")
+    assert {cell.config["learner"]["gamma"] for cell in changed.manifest.cells} == {0.5}
+    assert {cell.config["learner"]["gamma"] for cell in asis.manifest.cells} != {0.5}
+    assert [cell.label for cell in asis.manifest.cells] == [cell.label for cell in changed.manifest.cells]
+
+
+def test_changes_are_the_same_in_any_order(tmp_path: Path) -> None:
+    path, changes = write_grid(tmp_path), ["learner.gamma=0.5", "learner.gae_lambda=0.7"]
+    one, other = (plan(path, tmp_path / "runs", 1.0, given) for given in (changes, changes[::-1]))
+    assert one.grid.folder == other.grid.folder
+    assert other.new_runs == 0
+    assert plan(path, tmp_path / "runs", 1.0, changes[:1]).grid.folder != one.grid.folder
+
+
+def test_a_path_at_the_prompt_is_taken_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    for name, first in (("train", 0), ("test", 50)):
+        rows = "\n".join(f"{first + i},{0.01 * (first + i)},1.0,1.0" for i in range(3))
+        (here / f"{name}.csv").write_text(f"id,gate_x,gate_width,friction\n{rows}\n")
+    monkeypatch.chdir(here)
+    changes = ["instances.train=train.csv", "instances.test=test.csv"]
+    manifest = plan(write_grid(tmp_path), tmp_path / "runs", 1.0, changes).manifest
+    assert len(manifest.instances) == 2
+    [train] = {cell.config["instances"]["train"] for cell in manifest.cells}
+    stored = (tmp_path / "runs" / manifest.name / train).read_text()
+    assert [line.split(",")[0] for line in stored.splitlines()] == ["id", "0", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("seed=3", "'seeds' is the grid's own"),
+        ("tracking.uri=null", "'tracking' is the grid's own"),
+        ("name=other", "'name' is the grid's own"),
+        ("curriculum.kappa=2", "cells of this grid differ in curriculum.kappa"),
+        ("curriculum={kind: uniform}", "cells of this grid differ in curriculum.kappa"),
+        ("learner.gama=0.5", r"--set learner.gama=0.5: .*did you mean 'gamma'"),
+        ("learner.gamma", "write KEY=VALUE"),
+        ("instances.train=nowhere.csv", "nowhere.csv"),
+    ],
+)
+def test_changes_that_are_refused_are_named(tmp_path: Path, change: str, said: str) -> None:
+    path = write_grid(tmp_path, grid={"curriculum.kappa": [1, 4]})
+    with pytest.raises(ConfigError, match=said):
+        plan(path, tmp_path / "runs", 1.0, [change])
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_manifest_knows_its_changes_and_its_threshold(tmp_path: Path) -> None:
+    path = write_grid(tmp_path, threshold=0.25)
+    for changes in ((), ("learner.gamma=0.5",)):
+        manifest = plan(path, tmp_path / "runs", 1.0, changes).manifest
+        content = manifest.to_json()
+        assert Manifest.from_json(content, "test") == manifest
+        assert (manifest.changes, manifest.threshold) == (changes, 0.25)
+        assert (b'"changes"' in content) == bool(changes)  # manifests of before have none
+
+
+def test_changed_grids_are_found_by_their_changes(tmp_path: Path) -> None:
+    path, change = write_grid(tmp_path), "learner.gamma=0.5"
+    changed = plan(path, tmp_path / "runs", 1.0, [change]).grid
+    assert find_grid(path, tmp_path / "runs", 1.0, [change]).folder == changed.folder
+    with pytest.raises(LedgerError, match=r"--set learner.gamma=0.25` freezes it there"):
+        find_grid(path, tmp_path / "runs", 1.0, ["learner.gamma=0.25"])
+    with pytest.raises(LedgerError, match="grid plan"):
+        find_grid(path, tmp_path / "runs")
+    for frozen in (changed.folder, changed.manifest_file):
+        with pytest.raises(ConfigError, match="frozen already, with its settings"):
+            find_grid(frozen, tmp_path / "runs", 1.0, [change])
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two grids' files, of two tiny runs each."""
+    folder = tmp_path_factory.mktemp("two")
+    settings = {**TINY, **write_line_instances(folder)}
+    for name in ("one", "other"):
+        (folder / name).mkdir()
+    return [write_grid(folder / name, name=name, set=settings, seeds=[0], threshold=0.25) for name in ("one", "other")]
+
+
+def test_several_grids_run_one_after_the_other(
+    two: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = two[0].parent / "runs"
+    assert command(monkeypatch, "grid", "run", *two, "--root", root) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    for name in ("one", "other"):
+        assert f"{name}: 2 of 2 runs done" in told
+        grid = find_grid(root / name, root)
+        assert {grid.ledger(run).status().state for run in grid.manifest().runs()} == {"done"}
+
+
+@pytest.mark.parametrize("words", [["--part", "0-0"], ["--runs", "0123456789abcdef"]])
+def test_what_is_of_one_grid_is_refused_for_two(
+    two: list[Path], words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(monkeypatch, "grid", "run", *two, *words, "--root", two[0].parent / "none") == 2
+    assert "are of one grid, and here are 2" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_grid_named_twice_is_refused(
+    two: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(monkeypatch, "grid", "run", two[0], two[0], "--root", two[0].parent / "twice") == 2
+    assert "name each once" in capsys.readouterr().err
+
+
+def test_one_faulty_grid_of_two_starts_neither(
+    two: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = two[0].parent / "faulty"
+    assert command(monkeypatch, "grid", "run", *two, "--set", "learner.gama=1", "--root", root) == 2
+    assert "gama" in capsys.readouterr().err
+    assert command(monkeypatch, "grid", "run", two[0], two[0].parent / "absent.yaml", "--root", root) == 2
+    assert not [*root.glob("*/*/s0")]
+
+
+def test_reports_say_the_changes_and_count_to_the_files_threshold(
+    two: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change = "learner.gamma=0.5"
+    assert command(monkeypatch, "grid", "run", two[0], "--set", change, "--root", tmp_path) == 0
+    monkeypatch.setenv("COLUMNS", "200")
+    capsys.readouterr()
+    assert command(monkeypatch, "grid", "status", two[0], "--set", change, "--root", tmp_path) == 0
+    assert command(monkeypatch, "report", two[0], "--set", change, "--root", tmp_path) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"Not as the grid's file has it: --set {shlex.quote(change)}." in told
+    assert "Threshold of the test return: 0.25" in told.replace("0.250", "0.25")
+    grid = find_grid(two[0], tmp_path, 1.0, [change])
+    asked = build_grid_report(grid, tmp_path / "report", threshold=0.5)
+    assert any("Threshold of the test return: 0.5" in line for line in asked.summary)
+
+
+def test_python_takes_changes_as_well(two: list[Path], tmp_path: Path) -> None:
+    found = run_grid(two[0], root=tmp_path, overrides=["learner.gamma=0.5"], progress=False)
+    assert found.complete
+    assert found.manifest.changes == ("learner.gamma=0.5",)
