@@ -135,7 +135,7 @@ def why_not_drawn(run: Path) -> str | None:
     """What a folder lacks whose selections are to be drawn, in words; None if it lacks nothing."""
     needed = ("config.yaml", "instances_train.csv", "curriculum.jsonl")
     if missing := [name for name in needed if not (run / name).is_file()]:
-        return f"it has no {missing[0]}; the folder of one run is wanted, runs/quickstart/CELL/s0 for one"
+        return f"it has no {missing[0]}; the folder of one run is wanted, runs/pointmass_space/s0 for one"
     config = YAML(typ="safe").load((run / "config.yaml").read_text())
     kind, environment = config["curriculum"]["kind"], config["env"]["id"]
     if (kind, environment) != ("space", "space_dist/PointMass-v0"):

@@ -148,10 +148,11 @@ def test_configs_lists_and_copies(
     copied = sorted(path.relative_to("mine").as_posix() for path in Path("mine").rglob("*.*"))
     assert copied == [
         "grids/quickstart.yaml", "instances/pointmass_uniform_test.csv", "instances/pointmass_uniform_train.csv",
-        "pointmass_space.yaml",
+        "instances/wins/final/pointmass_uniform_padded.csv", "instances/wins/final/pointmass_uniform_test.csv",
+        "sparse_pointmass_edge.yaml",
     ]  # fmt: skip
-    assert command(monkeypatch, "config", "check", "mine/pointmass_space.yaml") == 0
-    assert command(monkeypatch, "configs", "--copy", "pointmass_space", "mine") == 2
+    assert command(monkeypatch, "config", "check", "mine/sparse_pointmass_edge.yaml") == 0
+    assert command(monkeypatch, "configs", "--copy", "sparse_pointmass_edge", "mine") == 2
     assert "exists" in capsys.readouterr().err
 
 

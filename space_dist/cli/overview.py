@@ -113,7 +113,7 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
         with contextlib.suppress(SpaceDistError, KeyError, IndexError):
             rows = ledger.rows(CURRICULUM)
             evaluations = [row for row in ledger.rows() if row["kind"] == "evaluation"]
-            shown = f"{evaluations[-1]['test']['return']:.1f}" if evaluations else "—"
+            shown = f"{evaluations[-1]['test']['return']:.3g}" if evaluations else "—"
             steps = rows[-1]["steps"] if rows else 0
             size = len(rows[-1]["trained"]) if rows else 0
             line = f"{steps:>10,} of {run.cell.steps_to_take:,} steps   set {size}   test return {shown}"
