@@ -28,8 +28,10 @@ def main() -> int:
 
     place, manifest = frozen(ROOT / "configs/grids/quickstart.yaml", Path.cwd() / "runs")
     steps = manifest.cells[0].budget_steps
-    say("Through gates of which three quarters are closed, and a reward at the goal alone: round robin, SPaCE and edge,")
-    say(f"{len(manifest.seeds)} seeds each, {steps:,} environment steps a run; tested on other gates, which are open")
+    say(
+        "Through gates of which three quarters are closed, and a reward at the goal alone: round robin, SPaCE and edge,"
+    )
+    say(f"{len(manifest.seeds)} seeds each, {steps:,} environment steps a run; tested on other gates, open ones")
     found = run_frozen(place, manifest, mode="pool")
     code = tell(manifest, place, found)
     if code:

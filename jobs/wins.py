@@ -31,7 +31,9 @@ from space_dist.report.tables import interval_text
 ROOT: Final = Path(__file__).resolve().parent.parent
 PAGE: Final = ROOT / "docs/wins.md"
 BEGIN, END = "<!-- worlds: made by jobs/wins.py -->", "<!-- end of worlds -->"
-WORLDS: Final = ("gates", "gates_padded", "narrow_padded", "goalmaze_padded")
+WORLDS: Final = (
+    "gates", "gates_padded", "gates_padded_second", "narrow_padded", "narrow_padded_second", "goalmaze_padded",
+)  # fmt: skip
 DENSE: Final = "dense"
 OURS, BASELINES = "edge", ("round_robin", "uniform")
 HALF, SURE = 0.5, 0.95  # of the steps; of P(better), early: a win

@@ -27,6 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs/wins.md").read_text()
 WINS, SETS = ROOT / "configs/wins", ROOT / "configs/instances/wins"
 WORLDS = ("gates", "gates_padded", "narrow_padded", "goalmaze_padded", "dense")
+SECOND = ("gates_padded", "narrow_padded")
 ARMS = ("round_robin", "uniform", "edge")
 SEARCHED = ("learning_rate", "ent_coef", "n_epochs", "n_steps", "unrewarded")
 OF_EDGE = {"outcome", "memory", "width", "strength", "uniform_share"}
@@ -35,7 +36,7 @@ OF_EDGE = {"outcome", "memory", "width", "strength", "uniform_share"}
 def test_the_sets_are_what_the_pages_commands_draw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [block] = re.findall(r"```bash\n(F=.*?)```", PAGE, re.DOTALL)
     lines = block.replace("space-dist ", "@ ").splitlines()
-    for folder, seed in (("final", "2200"), ("development", "2100")):
+    for folder, seed in (("final", "2200"), ("development", "2100"), ("second", "2300")):
         values = {"F": str(tmp_path / folder), "S": seed}
         for line in lines[1:]:
             told = Template(line).substitute(values)
@@ -54,12 +55,39 @@ def contexts(path: Path) -> set[tuple[str, ...]]:
         return {tuple(row[1:]) for row in list(csv.reader(file))[1:]}
 
 
-def test_final_instances_are_none_that_anything_was_chosen_on() -> None:
-    final = set[tuple[str, ...]]().union(*map(contexts, (SETS / "final").iterdir()))
-    other = [path for path in (ROOT / "configs/instances").rglob("*.csv") if path.parent != SETS / "final"]
+@pytest.mark.parametrize("folder", ["final", "second"])
+def test_final_instances_are_none_that_anything_was_chosen_on(folder: str) -> None:
+    final = set[tuple[str, ...]]().union(*map(contexts, (SETS / folder).iterdir()))
+    other = [path for path in (ROOT / "configs/instances").rglob("*.csv") if path.parent != SETS / folder]
     assert len(other) > 40
     for path in other:
         assert not final & contexts(path), path
+
+
+@pytest.mark.parametrize("world", SECOND)
+def test_the_second_round_has_what_more_seeds_chose_and_all_else_as_the_first(world: str) -> None:
+    with (ROOT / f"docs/results/wins/tuning/choose_{world}.csv").open() as file:
+        tried = list(csv.DictReader(file))
+    assert {row["seeds"] for row in tried} == {"10"}
+    grid, cells = load_grid(WINS / f"choose/{world}.yaml")
+    assert (len(cells), grid.seed_list()) == (12, tuple(range(100, 110)))
+    for arm in ARMS:
+        own = [row for row in tried if row["arm"] == arm]
+        assert len(own) == 4
+        best = max(own, key=lambda row: float(row["mean_area"]))
+        first, second = (read_yaml(WINS / name / f"{arm}.yaml") for name in (world, f"{world}_second"))
+        for key in SEARCHED:
+            found = str(second["learner"].pop(key))
+            assert found == best[f"learner.{key}"] or float(found) == float(best[f"learner.{key}"])
+            first["learner"].pop(key, None)
+        assert second.pop("name") == first.pop("name").replace(world, f"{world}_second")
+        assert second.pop("instances") == {
+            split: path.replace("/final/", "/second/") for split, path in first.pop("instances").items()
+        }
+        assert first == second
+    grids = [read_yaml(WINS / f"{name}.yaml") for name in (world, f"{world}_second")]
+    assert [one["seeds"]["start"] for one in grids] == [1000, 2000]
+    assert len({json.dumps([one["set"], one["threshold"], one["seeds"]["count"]]) for one in grids}) == 1
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -124,7 +152,7 @@ def test_the_page_says_what_the_kept_results_say() -> None:
     made = subprocess.run(
         [sys.executable, ROOT / "jobs/wins.py"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True
     ).stdout.strip()
-    for world in WORLDS:
+    for world in (*WORLDS, *(f"{one}_second" for one in SECOND)):
         assert f"results/wins/{world}/report.md" in made
     assert (
         PAGE.partition("<!-- worlds: made by jobs/wins.py -->")[2].partition("<!-- end of worlds -->")[0].strip()
