@@ -1,6 +1,6 @@
 """Artefacts: `make results NAME=pointmass_uniform` runs one grid of configs/paper and keeps what it shows.
 
-`NAME=wins` is every grid of configs/wins (docs/wins.md), `NAME=wins/gates` one of them, `NAME=all` all there are.
+`NAME=wins` is every grid of configs/wins and of its `why` (docs/wins.md), `NAME=wins/gates` one of them, `NAME=all` all there are.
 
 Into docs/results/NAME go the report, its numbers in full precision as CSV, its figures, and `provenance.json`: the
 command, the commit, the arithmetic, and how much was run. Run again anywhere, the numbers are the same, byte for byte.
@@ -48,7 +48,7 @@ def results(
 ) -> None:
     """Run grids, report on each, and keep the report with what it takes to make it again."""
     known = {path.stem: path for path in sorted(GRIDS.glob("*.yaml"))}
-    known |= {f"wins/{path.stem}": path for path in sorted(WINS.glob("*.yaml"))}
+    known |= {f"wins/{path.stem}": path for path in [*sorted(WINS.glob("*.yaml")), *sorted(WINS.glob("why/*.yaml"))]}
     chosen = {one: path for one, path in known.items() if name in (one, "all", one.rpartition("/")[0])}
     if not chosen:
         allowed = ["all", "wins", *known]

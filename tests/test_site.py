@@ -46,7 +46,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 ELSEWHERE = {  # whose blocks a test runs from the first to the last
     "python.md": "test_python.py", "sb3.md": "test_sb3.py", "your_environment.md": "test_user_env.py",
     "your_curriculum.md": "test_user_curriculum.py", "your_learner.md": "test_user_learner.py",
-    "causes.md": "test_headroom.py",
+    "causes.md": "test_headroom.py", "wins.md": "test_wins.py",
 }  # fmt: skip
 SMALL = (
     "budget.steps=1024", "evaluation.every_steps=1024", "learner.n_steps=512", "learner.batch_size=64",
