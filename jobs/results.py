@@ -48,7 +48,8 @@ def results(
 ) -> None:
     """Run grids, report on each, and keep the report with what it takes to make it again."""
     known = {path.stem: path for path in sorted(GRIDS.glob("*.yaml"))}
-    known |= {f"wins/{path.stem}": path for path in [*sorted(WINS.glob("*.yaml")), *sorted(WINS.glob("why/*.yaml"))]}
+    of_wins = [*sorted(WINS.glob("*.yaml")), *sorted(WINS.glob("why/*.yaml"))]
+    known |= {f"wins/{path.stem}": path for path in of_wins}
     chosen = {one: path for one, path in known.items() if name in (one, "all", one.rpartition("/")[0])}
     if not chosen:
         allowed = ["all", "wins", *known]
