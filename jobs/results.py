@@ -1,7 +1,6 @@
 """Artefacts: `make results NAME=pointmass_uniform` runs one grid of configs/paper and keeps what it shows.
 
-`NAME=wins` is every grid of configs/wins and of its `why` (docs/wins.md), `NAME=wins/gates` one of them, `NAME=all` every
-one there is.
+`NAME=wins` is every grid of configs/wins and its `why` (docs/wins.md), `NAME=wins/gates` one of them, `NAME=all` all.
 
 Into docs/results/NAME go the report, its numbers in full precision as CSV, its figures, and `provenance.json`: the
 command, the commit, the arithmetic, and how much was run. Run again anywhere, the numbers are the same, byte for byte.
