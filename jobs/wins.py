@@ -1,14 +1,16 @@
-"""The table of docs/wins.md, from what docs/results/wins holds: numbers and verdicts by the page's own rules.
+"""The tables of docs/wins.md, from what docs/results/wins holds: numbers and verdicts by the page's own rules.
 
-    python jobs/wins.py            # print the table
-    python jobs/wins.py --write    # and put it into docs/wins.md
+    python jobs/wins.py            # print the tables
+    python jobs/wins.py --write    # and put them into docs/wins.md
 
 A world that was not run, or only in small, gets no verdict.
 """
 
 from __future__ import annotations
 
+import functools
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -30,11 +32,13 @@ from space_dist.report.tables import interval_text
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 PAGE: Final = ROOT / "docs/wins.md"
-BEGIN, END = "<!-- worlds: made by jobs/wins.py -->", "<!-- end of worlds -->"
+FOLDER: Final = ROOT / "docs/results/wins"
 WORLDS: Final = (
     "gates", "gates_padded", "gates_padded_second", "narrow_padded", "narrow_padded_second", "goalmaze_padded",
 )  # fmt: skip
 DENSE: Final = "dense"
+SHARES: Final = {"50": "share_50", "75": "gates_padded_second", "90": "share_90"}
+WHY: Final = ("rivals", "yoked", "fork")
 OURS, BASELINES = "edge", ("round_robin", "uniform")
 HALF, SURE = 0.5, 0.95  # of the steps; of P(better), early: a win
 
@@ -64,15 +68,13 @@ def won(ours: Cell, theirs: Cell, threshold: float) -> bool:
 
 def world_rows(name: str, found: Artefact) -> list[str]:
     """Of one world: a row an arm."""
-    threshold = float(found.rows("cells.csv")[0]["threshold"])
+    threshold = _threshold(found)
     ours = found.cells[OURS]
     verdict = "a win" if all(won(ours, found.cells[arm], threshold) for arm in BASELINES) else "no win"
     lines = []
     for label in (*BASELINES, OURS):
         cell = found.cells[label]
-        seeds = sorted(cell.curves)
-        taken = steps(cell, seeds, threshold)
-        never = sum(np.isnan(steps_to_threshold(*cell.curves[seed], threshold)) for seed in seeds)
+        taken, never = _arrived(cell, threshold)
         beside = ["", ""]
         if label != OURS:
             beside = [interval_text(ratio(ours, cell, threshold), 2), interval_text(early(ours, cell), 2)]
@@ -80,7 +82,7 @@ def world_rows(name: str, found: Artefact) -> list[str]:
         world = f"[`{name}`](results/wins/{name}/report.md), {threshold:g}" if label == BASELINES[0] else ""
         lines.append(
             f"| {world} | {label} "
-            f"| {taken.mean():,.0f} | {never} | {' | '.join(beside)} | {interval_text(cell.iqm('early'), 2)} "
+            f"| {taken:,.0f} | {never} | {' | '.join(beside)} | {interval_text(cell.iqm('early'), 2)} "
             f"| {interval_text(cell.iqm('final'), 2)} | {_interval(worst, 'worst_iqm')} "
             f"| {(f'*{verdict}*' if found.whole else '*not run whole*') if label == OURS else ''} |"
         )
@@ -115,35 +117,98 @@ def dense_rows(found: Artefact) -> list[str]:
     ]  # fmt: skip
 
 
+def share_rows() -> list[str]:
+    """Of the padded gates, by the share of them that are closed."""
+    lines = [
+        "| closed | round robin: steps, never | uniform | edge | edge's ratio to round robin | P(edge better), early "
+        "| to uniform | P, early |", "|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]  # fmt: skip
+    for share, name in SHARES.items():
+        found = Artefact(FOLDER / name)
+        threshold = _threshold(found)
+        cells = [found.cells[label] for label in (*BASELINES, OURS)]
+        told = [f"{taken:,.0f}, {never} of {len(cell.curves)}"
+                for cell in cells for taken, never in [_arrived(cell, threshold)]]  # fmt: skip
+        for theirs in cells[:2]:
+            told += [interval_text(ratio(cells[2], theirs, threshold), 2), interval_text(early(cells[2], theirs), 2)]
+        lines.append(f"| [{share} %](results/wins/{name}/report.md) | {' | '.join(told)} |")
+    return lines
+
+
+def why_rows(name: str) -> list[str]:
+    """A row a cell, beside the grid's baseline."""
+    found = Artefact(FOLDER / name)
+    threshold = _threshold(found)
+    rows = found.rows("cells.csv")
+    label = next(row["configuration"] for row in rows if row["cell"] == row["baseline"])
+    baseline = found.cells[label]
+    lines = [
+        "| | mean steps to it | never | ratio of steps | P(better), early | early | final |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        cell = found.cells[row["configuration"]]
+        taken, never = _arrived(cell, threshold)
+        beside = "1 | "
+        if cell is not baseline:
+            beside = f"{interval_text(ratio(cell, baseline, threshold), 2)} | {interval_text(early(cell, baseline), 2)}"
+        lines.append(
+            f"| {row['configuration']} | {taken:,.0f} | {never} | {beside} | {interval_text(cell.iqm('early'), 2)} "
+            f"| {interval_text(cell.iqm('final'), 2)} |"
+        )
+    return lines
+
+
+def _arrived(cell: Cell, threshold: float) -> tuple[float, int]:
+    """The mean of the steps, and how many seeds never arrive."""
+    seeds = sorted(cell.curves)
+    never = sum(bool(np.isnan(steps_to_threshold(*cell.curves[seed], threshold))) for seed in seeds)
+    return float(steps(cell, seeds, threshold).mean()), never
+
+
+def _threshold(found: Artefact) -> float:
+    return float(found.rows("cells.csv")[0]["threshold"])
+
+
 def _interval(row: dict[str, str], name: str) -> str:
     """From the columns of `cells.csv`."""
     value, low, high = (float(text) if (text := row[f"{name}{end}"]) else None for end in ("", "_low", "_high"))
     return "" if value is None else interval_text(Interval(value, low, high), 2)
 
 
-def table() -> str:
+def worlds() -> str:
     """Of the worlds that were run."""
     lines = [
         "| world, threshold | arm | mean steps to it | never | edge's ratio of steps | P(edge better), early | early "
         "| final | worst tenth | |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---|",
     ]
-    folder = ROOT / "docs/results/wins"
     for name in WORLDS:
-        if (folder / name / "provenance.json").exists():
-            lines += world_rows(name, Artefact(folder / name))
-    if (folder / DENSE / "provenance.json").exists():
-        lines += ["", f"[`dense`](results/wins/{DENSE}/report.md), return:", "", *dense_rows(Artefact(folder / DENSE))]
+        if _kept(name):
+            lines += world_rows(name, Artefact(FOLDER / name))
+    if _kept(DENSE):
+        lines += ["", f"[`dense`](results/wins/{DENSE}/report.md), return:", "", *dense_rows(Artefact(FOLDER / DENSE))]
     return "\n".join(lines)
+
+
+def _kept(name: str) -> bool:
+    return (FOLDER / name / "provenance.json").exists()
+
+
+TABLES: Final[Mapping[str, Callable[[], str]]] = {
+    "worlds": worlds,
+    "shares": lambda: "\n".join(share_rows()),
+    **{name: functools.partial(lambda one: "\n".join(why_rows(one)), name) for name in WHY},
+}
 
 
 def main() -> int:
     """Print, or write."""
-    made = table()
-    if sys.argv[1:] == ["--write"]:
-        put_between(PAGE, BEGIN, END, made)
-    else:
-        print(made)
+    for name, made in TABLES.items():
+        if sys.argv[1:] == ["--write"]:
+            put_between(PAGE, f"<!-- {name}: made by jobs/wins.py -->", f"<!-- end of {name} -->", made())
+        else:
+            print(f"{name}\n\n{made()}\n")
     return 0
 
 

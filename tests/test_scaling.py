@@ -54,6 +54,22 @@ def test_a_grid_in_small_has_less_of_seeds_and_steps_and_all_else(tmp_path: Path
         }
 
 
+def test_what_changes_on_the_way_does_so_at_the_same_share(tmp_path: Path) -> None:
+    changes = [{"steps": 10_000, "set": {"learner.gamma": 0.5}}, {"steps": 20_000, "set": {"learner.gamma": 0.9}}]
+    settings = {
+        "budget.steps": 40_000,
+        "learner.n_steps": 512,
+        "fork": {"seed": 7, "steps": 10_000},
+        "schedule": changes,
+    }
+    path = write_grid(tmp_path, set=settings)
+    for scale, expected in ((1.0, [10_000, 10_000, 20_000]), (0.25, [2_500, 2_500, 5_000])):
+        for cell in plan(path, tmp_path / "runs", scale).manifest.cells:
+            found = [cell.config["fork"]["steps"], *(change["steps"] for change in cell.config["schedule"])]
+            assert found == expected
+            assert cell.config["fork"]["seed"] == 7
+
+
 def test_one_update_is_the_least(tmp_path: Path) -> None:
     path = write_grid(tmp_path, set={"budget.steps": 40_000, "learner.n_steps": 512})
     assert {cell.budget_steps for cell in plan(path, tmp_path / "runs", 0.001).manifest.cells} == {512}

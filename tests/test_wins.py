@@ -6,8 +6,6 @@ import csv
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -20,7 +18,7 @@ from space_dist.config import read_yaml
 from space_dist.experiment.manifest import load_grid
 from space_dist.grid.planning import plan
 from tests.commanding import command
-from tests.patience import PATIENCE
+from tests.shell import Shell, bash_blocks, one_supervisor
 from tests.test_paper import load_job
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -136,7 +134,27 @@ def test_a_world_has_its_budget_threshold_and_seeds_as_the_page_says(world: str)
         assert Path(search["set"][f"instances.{split}"]).parts[-2:] == ("development", used.name)
 
 
-@pytest.mark.parametrize("path", sorted(WINS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_commands_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In small, by bash; the first block is what the sets were drawn by, above."""
+    drawn, ours, theirs = bash_blocks("wins.md")
+    assert drawn.startswith("F=")
+    shell = Shell(tmp_path / "clone", monkeypatch)
+    sets = "configs/instances/wins/development/pointmass_uniform_"
+    with one_supervisor():
+        shell.run(ours)
+        shell.run(theirs, {"TRAIN.csv": f"{sets}padded.csv", "TEST.csv": f"{sets}test.csv"})
+    runs = tmp_path / "clone/runs"
+    [changed] = runs.glob("wins-gates-padded-second-set-*")
+    assert {path.parent.parent.name for path in runs.glob("*/report/report.html")} == {
+        "wins-gates-padded-second", changed.name
+    }  # fmt: skip
+    assert {path.name for path in runs.glob("wins-*")} - {changed.name} == {
+        f"wins-{path.stem.replace('_', '-')}" for path in WINS.glob("*.yaml")
+    }
+    assert "Not as the grid's file has it" in (changed / "report/report.md").read_text()
+
+
+@pytest.mark.parametrize("path", sorted([*WINS.glob("*.yaml"), *WINS.glob("why/*.yaml")]), ids=lambda path: path.stem)
 def test_a_grid_can_be_run_in_small_and_on_other_instances(path: Path, tmp_path: Path) -> None:
     small = plan(path, tmp_path, 0.02)
     assert len(small.manifest.seeds) == 1
@@ -148,16 +166,14 @@ def test_a_grid_can_be_run_in_small_and_on_other_instances(path: Path, tmp_path:
         assert changed.manifest.name.startswith(f"{load_grid(path)[0].name}-set-")
 
 
-def test_the_page_says_what_the_kept_results_say() -> None:
-    made = subprocess.run(
-        [sys.executable, ROOT / "jobs/wins.py"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True
-    ).stdout.strip()
+def test_the_page_says_what_the_kept_results_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Number for number: the tables are made of them again."""
+    tables = load_job("wins", monkeypatch).TABLES
     for world in (*WORLDS, *(f"{one}_second" for one in SECOND)):
-        assert f"results/wins/{world}/report.md" in made
-    assert (
-        PAGE.partition("<!-- worlds: made by jobs/wins.py -->")[2].partition("<!-- end of worlds -->")[0].strip()
-        == made
-    )
+        assert f"results/wins/{world}/report.md" in tables["worlds"]()
+    for name, made in tables.items():
+        there = PAGE.partition(f"<!-- {name}: made by jobs/wins.py -->")[2].partition(f"<!-- end of {name} -->")[0]
+        assert there.strip() == made()
 
 
 class Kept:
@@ -184,7 +200,7 @@ def wins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """jobs/wins.py, which looks for kept results in `tmp_path`."""
     monkeypatch.syspath_prepend(str(ROOT / "jobs"))
     module = load_job("wins", monkeypatch)
-    monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(module, "FOLDER", tmp_path / "docs/results/wins")
     return module
 
 
@@ -207,7 +223,7 @@ def test_a_win_is_half_of_the_steps_against_both(
     wins: Any, tmp_path: Path, jumps: dict[str, int], verdict: str
 ) -> None:
     Kept(tmp_path / "docs/results/wins/gates", {arm: (spread(jump), 0.9) for arm, jump in jumps.items()})
-    made = wins.table()
+    made = wins.worlds()
     assert made.count("[`gates`]") == 1
     assert verdict in made
     expected = (
@@ -222,18 +238,18 @@ def test_a_win_must_be_sure(wins: Any, tmp_path: Path) -> None:
     some[:5] = [95_000] * 5
     found = {"round_robin": (spread(90_000), 0.9), "uniform": (spread(90_000), 0.9), "edge": (some, 0.9)}
     Kept(tmp_path / "docs/results/wins/gates", found)
-    assert "*no win*" in wins.table()
+    assert "*no win*" in wins.worlds()
 
 
 def test_what_was_run_in_small_has_no_verdict(wins: Any, tmp_path: Path) -> None:
     folder = tmp_path / "docs/results/wins/gates"
     Kept(folder, {arm: (spread(20_000), 0.9) for arm in ARMS})
     (folder / "provenance.json").write_text(json.dumps({"scale": 0.1}))
-    assert "*not run whole*" in wins.table()
+    assert "*not run whole*" in wins.worlds()
 
 
 @pytest.mark.parametrize(("level", "words"), [(1.0, "*nothing lost*"), (0.97, "*nothing lost*"), (0.9, "*lost*")])
 def test_the_dense_world_may_lose_a_twentieth(wins: Any, tmp_path: Path, level: float, words: str) -> None:
     found = {arm: (spread(50_000), level if arm == "edge" else 1.0) for arm in ARMS}
     Kept(tmp_path / "docs/results/wins/dense", found, threshold="1.0")
-    assert words in wins.table()
+    assert words in wins.worlds()

@@ -40,9 +40,10 @@ def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
     """A run of that share of the budget, at least one update of it.
 
     There are fewer evaluations, by the share's square root rounded down, evenly spread, and always at the start and the
-    end: curves remain, and evaluating, which is most of the cost of a short run, costs less as well. All else stays, so
-    schedules over the budget are steeper, and a set that grows by one gets less far. `where` names the config in
-    errors. Raises ConfigError if the result is no config.
+    end: curves remain, and evaluating, which is most of the cost of a short run, costs less as well. What changes on
+    the way (`fork`, `schedule`) does so at the same share of the budget. All else stays, so a learning rate's schedule
+    is steeper, and a set that grows by one gets less far. `where` names the config in errors. Raises ConfigError if the
+    result is no config.
     """
     if scale == WHOLE:
         return config
@@ -55,6 +56,8 @@ def shorter(config: RunConfig, scale: float, where: str) -> RunConfig:
     if isinstance(evaluation["every_steps"], int):
         count = max(1, math.floor(whole / evaluation["every_steps"] * math.sqrt(scale) + 1e-6))
         evaluation["every_steps"] = math.ceil(budget["steps"] / count)
+    for change in (*data["schedule"], *([data["fork"]] if data["fork"] else [])):
+        change["steps"] = math.ceil(change["steps"] * scale - 1e-6)
     return configs.parse(data, where)
 
 
