@@ -20,6 +20,7 @@ import space_dist  # noqa: F401 - before NumPy, whose settings it makes
 import numpy as np
 from kept import SAME, Artefact, Cell, put_between
 
+from space_dist.experiment.manifest import load_grid
 from space_dist.report.outcomes import paired_difference
 from space_dist.report.statistics import (
     Interval,
@@ -32,6 +33,7 @@ from space_dist.report.tables import interval_text
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 PAGE: Final = ROOT / "docs/wins.md"
+WINS: Final = ROOT / "configs/wins"
 FOLDER: Final = ROOT / "docs/results/wins"
 WORLDS: Final = (
     "gates", "gates_padded", "gates_padded_second", "narrow_padded", "narrow_padded_second", "goalmaze_padded",
@@ -43,16 +45,42 @@ OURS, BASELINES = "edge", ("round_robin", "uniform")
 HALF, SURE = 0.5, 0.95  # of the steps; of P(better), early: a win
 
 
-def steps(cell: Cell, seeds: list[int], threshold: float) -> np.ndarray:
-    """`(n,)` environment steps of each seed until the threshold; those that never reach it count as the budget."""
-    times = [steps_to_threshold(*cell.curves[seed], threshold) for seed in seeds]
-    return np.asarray(restricted(np.array(times), cell.budget))
+@functools.cache
+def budget_of(name: str) -> int:
+    """Environment steps that each run of a grid may take."""
+    path = next(path for path in (WINS / f"{name}.yaml", WINS / f"why/{name}.yaml") if path.exists())
+    [budget] = {data["budget"]["steps"] for _, data in load_grid(path)[1]}
+    return int(budget)
 
 
-def ratio(ours: Cell, theirs: Cell, threshold: float) -> Interval:
-    """Of the restricted mean steps to the threshold, seed by seed."""
-    seeds = sorted({*ours.curves} & {*theirs.curves})
-    return paired_ratio(steps(ours, seeds, threshold), steps(theirs, seeds, threshold))
+class World(Artefact):
+    """What is kept of a grid; a run that never reaches its threshold counts as its budget."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(FOLDER / name)
+        self.budget, first = budget_of(name), self.rows("cells.csv")[0]["threshold"]
+        self.threshold = float(first) if first else np.nan
+
+    def times(self, cell: Cell) -> dict[int, float]:
+        """Steps to the threshold by seed; NaN for those that never reach it."""
+        return {seed: steps_to_threshold(*cell.curves[seed], self.threshold) for seed in sorted(cell.curves)}
+
+    def arrived(self, cell: Cell) -> tuple[float, int]:
+        """The mean of the steps, and how many seeds never arrive."""
+        times = np.array([*self.times(cell).values()])
+        return float(restricted(times, self.budget).mean()), int(np.isnan(times).sum())
+
+    def ratio(self, ours: Cell, theirs: Cell) -> Interval:
+        """Of the mean steps, seed by seed."""
+        mine, other = self.times(ours), self.times(theirs)
+        both = [seed for seed in mine if seed in other]
+        return paired_ratio(
+            *(restricted(np.array([times[seed] for seed in both]), self.budget) for times in (mine, other))
+        )
+
+    def won(self, ours: Cell, theirs: Cell) -> bool:
+        """By the rules of the page."""
+        return self.ratio(ours, theirs).value <= HALF and early(ours, theirs).value >= SURE
 
 
 def early(ours: Cell, theirs: Cell) -> Interval:
@@ -61,25 +89,20 @@ def early(ours: Cell, theirs: Cell) -> Interval:
     return probability_of_improvement(mine, other)
 
 
-def won(ours: Cell, theirs: Cell, threshold: float) -> bool:
-    """By the rules of the page."""
-    return ratio(ours, theirs, threshold).value <= HALF and early(ours, theirs).value >= SURE
-
-
-def world_rows(name: str, found: Artefact) -> list[str]:
+def world_rows(name: str) -> list[str]:
     """Of one world: a row an arm."""
-    threshold = _threshold(found)
+    found = World(name)
     ours = found.cells[OURS]
-    verdict = "a win" if all(won(ours, found.cells[arm], threshold) for arm in BASELINES) else "no win"
+    verdict = "a win" if all(found.won(ours, found.cells[arm]) for arm in BASELINES) else "no win"
     lines = []
     for label in (*BASELINES, OURS):
         cell = found.cells[label]
-        taken, never = _arrived(cell, threshold)
+        taken, never = found.arrived(cell)
         beside = ["", ""]
         if label != OURS:
-            beside = [interval_text(ratio(ours, cell, threshold), 2), interval_text(early(ours, cell), 2)]
+            beside = [interval_text(found.ratio(ours, cell), 2), interval_text(early(ours, cell), 2)]
         worst = found.row("cells.csv", label, "configuration")
-        world = f"[`{name}`](results/wins/{name}/report.md), {threshold:g}" if label == BASELINES[0] else ""
+        world = f"[`{name}`](results/wins/{name}/report.md), {found.threshold:g}" if label == BASELINES[0] else ""
         lines.append(
             f"| {world} | {label} "
             f"| {taken:,.0f} | {never} | {' | '.join(beside)} | {interval_text(cell.iqm('early'), 2)} "
@@ -124,21 +147,19 @@ def share_rows() -> list[str]:
         "| to uniform | P, early |", "|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]  # fmt: skip
     for share, name in SHARES.items():
-        found = Artefact(FOLDER / name)
-        threshold = _threshold(found)
+        found = World(name)
         cells = [found.cells[label] for label in (*BASELINES, OURS)]
         told = [f"{taken:,.0f}, {never} of {len(cell.curves)}"
-                for cell in cells for taken, never in [_arrived(cell, threshold)]]  # fmt: skip
+                for cell in cells for taken, never in [found.arrived(cell)]]  # fmt: skip
         for theirs in cells[:2]:
-            told += [interval_text(ratio(cells[2], theirs, threshold), 2), interval_text(early(cells[2], theirs), 2)]
+            told += [interval_text(found.ratio(cells[2], theirs), 2), interval_text(early(cells[2], theirs), 2)]
         lines.append(f"| [{share} %](results/wins/{name}/report.md) | {' | '.join(told)} |")
     return lines
 
 
 def why_rows(name: str) -> list[str]:
     """A row a cell, beside the grid's baseline."""
-    found = Artefact(FOLDER / name)
-    threshold = _threshold(found)
+    found = World(name)
     rows = found.rows("cells.csv")
     label = next(row["configuration"] for row in rows if row["cell"] == row["baseline"])
     baseline = found.cells[label]
@@ -148,26 +169,15 @@ def why_rows(name: str) -> list[str]:
     ]
     for row in rows:
         cell = found.cells[row["configuration"]]
-        taken, never = _arrived(cell, threshold)
+        taken, never = found.arrived(cell)
         beside = "1 | "
         if cell is not baseline:
-            beside = f"{interval_text(ratio(cell, baseline, threshold), 2)} | {interval_text(early(cell, baseline), 2)}"
+            beside = f"{interval_text(found.ratio(cell, baseline), 2)} | {interval_text(early(cell, baseline), 2)}"
         lines.append(
             f"| {row['configuration']} | {taken:,.0f} | {never} | {beside} | {interval_text(cell.iqm('early'), 2)} "
             f"| {interval_text(cell.iqm('final'), 2)} |"
         )
     return lines
-
-
-def _arrived(cell: Cell, threshold: float) -> tuple[float, int]:
-    """The mean of the steps, and how many seeds never arrive."""
-    seeds = sorted(cell.curves)
-    never = sum(bool(np.isnan(steps_to_threshold(*cell.curves[seed], threshold))) for seed in seeds)
-    return float(steps(cell, seeds, threshold).mean()), never
-
-
-def _threshold(found: Artefact) -> float:
-    return float(found.rows("cells.csv")[0]["threshold"])
 
 
 def _interval(row: dict[str, str], name: str) -> str:
@@ -185,7 +195,7 @@ def worlds() -> str:
     ]
     for name in WORLDS:
         if _kept(name):
-            lines += world_rows(name, Artefact(FOLDER / name))
+            lines += world_rows(name)
     if _kept(DENSE):
         lines += ["", f"[`dense`](results/wins/{DENSE}/report.md), return:", "", *dense_rows(Artefact(FOLDER / DENSE))]
     return "\n".join(lines)

@@ -201,6 +201,7 @@ def wins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     monkeypatch.syspath_prepend(str(ROOT / "jobs"))
     module = load_job("wins", monkeypatch)
     monkeypatch.setattr(module, "FOLDER", tmp_path / "docs/results/wins")
+    monkeypatch.setattr(module, "budget_of", lambda name: 100_000)
     return module
 
 
