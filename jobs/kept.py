@@ -89,6 +89,8 @@ class Artefact:
 
 
 def put_between(page: Path, begin: str, end: str, made: str) -> None:
-    """Put what was made into a page, between two marks."""
-    before, _, rest = page.read_text().partition(begin)
+    """Put what was made into a page, between two marks. Raises ValueError if the page does not have them, in order."""
+    before, found, rest = page.read_text().partition(begin)
+    if not found or end not in rest:
+        raise ValueError(f"{page} lacks {begin!r} and, behind it, {end!r}")
     atomic_write(page, f"{before}{begin}\n\n{made}\n\n{end}{rest.partition(end)[2]}".encode())

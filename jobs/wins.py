@@ -147,6 +147,8 @@ def share_rows() -> list[str]:
         "| to uniform | P, early |", "|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]  # fmt: skip
     for share, name in SHARES.items():
+        if not _kept(name):
+            continue
         found = World(name)
         cells = [found.cells[label] for label in (*BASELINES, OURS)]
         told = [f"{taken:,.0f}, {never} of {len(cell.curves)}"
@@ -158,7 +160,9 @@ def share_rows() -> list[str]:
 
 
 def why_rows(name: str) -> list[str]:
-    """A row a cell, beside the grid's baseline."""
+    """A row a cell, beside the grid's baseline; none if it was not run."""
+    if not _kept(name):
+        return []
     found = World(name)
     rows = found.rows("cells.csv")
     label = next(row["configuration"] for row in rows if row["cell"] == row["baseline"])
