@@ -90,7 +90,7 @@ def early(ours: Cell, theirs: Cell) -> Interval:
 
 
 def world_rows(name: str) -> list[str]:
-    """Of one world: a row an arm."""
+    """Of one world: a row an arm, of how soon it arrives."""
     found = World(name)
     ours = found.cells[OURS]
     verdict = "a win" if all(found.won(ours, found.cells[arm]) for arm in BASELINES) else "no win"
@@ -98,21 +98,29 @@ def world_rows(name: str) -> list[str]:
     for label in (*BASELINES, OURS):
         cell = found.cells[label]
         taken, never = found.arrived(cell)
-        beside = ["", ""]
+        beside = ["", f"*{verdict}*" if found.whole else "*not run whole*"]
         if label != OURS:
             beside = [interval_text(found.ratio(ours, cell), 2), interval_text(early(ours, cell), 2)]
-        worst = found.row("cells.csv", label, "configuration")
         world = f"[`{name}`](results/wins/{name}/report.md), {found.threshold:g}" if label == BASELINES[0] else ""
+        lines.append(f"| {world} | {label} | {taken:,.0f} | {never} | {' | '.join(beside)} |")
+    return lines
+
+
+def level_rows(name: str) -> list[str]:
+    """Of one world: a row an arm, of how much it learned."""
+    found = Artefact(FOLDER / name)
+    lines = []
+    for label in (*BASELINES, OURS):
+        cell = found.cells[label]
+        worst = _interval(found.row("cells.csv", label, "configuration"), "worst_iqm")
         lines.append(
-            f"| {world} | {label} "
-            f"| {taken:,.0f} | {never} | {' | '.join(beside)} | {interval_text(cell.iqm('early'), 2)} "
-            f"| {interval_text(cell.iqm('final'), 2)} | {_interval(worst, 'worst_iqm')} "
-            f"| {(f'*{verdict}*' if found.whole else '*not run whole*') if label == OURS else ''} |"
+            f"| {f'`{name}`' if label == BASELINES[0] else ''} | {label} | {interval_text(cell.iqm('early'), 2)} "
+            f"| {interval_text(cell.iqm('final'), 2)} | {worst} |"
         )
     return lines
 
 
-def dense_rows(found: Artefact) -> list[str]:
+def dense_verdict(found: Artefact) -> str:
     """Of the world in which nothing is to be won."""
     ours, theirs = (found.cells[label] for label in (OURS, BASELINES[0]))
     seeds = sorted({*ours.curves} & {*theirs.curves})
@@ -125,19 +133,11 @@ def dense_rows(found: Artefact) -> list[str]:
         verdict = "nothing lost in the mean, and more than that not excluded"
     else:
         verdict = "lost"
-    lines = ["| arm | early | final | worst tenth |", "|---|---:|---:|---:|"]
-    for label in (*BASELINES, OURS):
-        cell = found.cells[label]
-        worst = _interval(found.row("cells.csv", label, "configuration"), "worst_iqm")
-        lines.append(
-            f"| {label} | {interval_text(cell.iqm('early'), 2)} | {interval_text(cell.iqm('final'), 2)} | {worst} |"
-        )
     told = "" if found.whole else " Not run whole."
-    return [
-        *lines, "",
-        f"Edge less round robin, final, by seed: {interval_text(difference, 2)}; 5 % of what round robin learned are "
-        f"{margin:.2f}: *{verdict}*.{told}",
-    ]  # fmt: skip
+    return (
+        f"[`dense`](results/wins/{DENSE}/report.md): edge less round robin, final return, by seed: "
+        f"{interval_text(difference, 2)}; 5 % of what round robin learned are {margin:.2f}: *{verdict}*.{told}"
+    )
 
 
 def share_rows() -> list[str]:
@@ -191,18 +191,19 @@ def _interval(row: dict[str, str], name: str) -> str:
 
 
 def worlds() -> str:
-    """Of the worlds that were run."""
+    """Of the worlds that were run: how soon, and how much."""
     lines = [
-        "| world, threshold | arm | mean steps to it | never | edge's ratio of steps | P(edge better), early | early "
-        "| final | worst tenth | |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---|",
+        "| world, threshold | arm | mean steps to it | never | edge's ratio of steps | P(edge better), early |",
+        "|---|---|---:|---:|---:|---:|",
     ]
-    for name in WORLDS:
-        if _kept(name):
-            lines += world_rows(name)
-    if _kept(DENSE):
-        lines += ["", f"[`dense`](results/wins/{DENSE}/report.md), return:", "", *dense_rows(Artefact(FOLDER / DENSE))]
-    return "\n".join(lines)
+    kept = [name for name in WORLDS if _kept(name)]
+    for name in kept:
+        lines += world_rows(name)
+    dense = [DENSE] if _kept(DENSE) else []
+    lines += ["", "| world | arm | early | final | worst tenth |", "|---|---|---:|---:|---:|"]
+    for name in (*kept, *dense):
+        lines += level_rows(name)
+    return "\n".join([*lines, "", *(dense_verdict(Artefact(FOLDER / name)) for name in dense)]).strip()
 
 
 def _kept(name: str) -> bool:
