@@ -80,6 +80,19 @@ def supervisors(conductor: BaseProcess) -> list[psutil.Process]:
             if "space_dist.grid.supervisor" in child.cmdline()]  # fmt: skip
 
 
+def lives(process: psutil.Process) -> bool:
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def kill(supervisor: psutil.Process) -> None:
+    """Returns once it is dead, and so the run below it asked to end: a signal's sender does not wait for it."""
+    supervisor.kill()
+    await_(lambda: not lives(supervisor), "its death")
+
+
 def is_under_way(grid: Grid, number: int) -> bool:
     ledger = grid.ledger(grid.manifest().runs()[number]) if grid.manifest_file.exists() else None
     return ledger is not None and ledger.status_file.exists() and ledger.owner_alive() and ledger.status().round > 0
@@ -109,7 +122,7 @@ def test_another_supervisor_takes_over_from_one_that_was_killed(
     under_way: tuple[BaseProcess, psutil.Process, Grid], reference: list[list[Row]], gate: Path, tmp_path: Path
 ) -> None:  # fmt: skip
     conductor, supervisor, grid = under_way
-    supervisor.kill()
+    kill(supervisor)
     gate.unlink()
     assert rows(finished(conductor, tmp_path)) == reference
     assert ends(grid) == [["killed", None], [None]]
@@ -126,8 +139,7 @@ def test_nobody_outlives_a_conductor_that_ends_and_the_next_one_goes_on(
     psutil.Process(conductor.pid).send_signal(number)
     conductor.join(PATIENCE)
     assert conductor.exitcode == code
-    await_(lambda: not any(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in family),
-           "the supervisor and its run to end")  # fmt: skip
+    await_(lambda: not any(map(lives, family)), "the supervisor and its run to end")
     first, second = (grid.ledger(run) for run in grid.manifest().runs())
     assert (first.status().state, second.status_file.exists()) == ("interrupted", False)
     gate.unlink()
@@ -165,7 +177,7 @@ def test_two_side_by_side_are_the_same_and_one_that_is_killed_costs_the_other_no
     try:
         await_(lambda: is_under_way(grid, 0) and is_under_way(grid, 1), "both runs to be under way")
         first, second = supervisors(conductor)
-        first.kill()
+        kill(first)
         gate.unlink()
         assert rows(finished(conductor, tmp_path)) == reference
     finally:
@@ -173,7 +185,7 @@ def test_two_side_by_side_are_the_same_and_one_that_is_killed_costs_the_other_no
         conductor.join()
     assert sorted(map(len, ends(grid))) == [1, 2]
     assert sorted(str(cause) for each in ends(grid) for cause in each) == ["None", "None", "killed"]
-    assert not any(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in (first, second))
+    assert not any(map(lives, (first, second)))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
@@ -190,7 +202,7 @@ def test_nobody_outlives_a_conductor_of_several_places(
     finally:
         conductor.kill()
         conductor.join()
-    await_(lambda: not any(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in family), "their ends")
+    await_(lambda: not any(map(lives, family)), "their ends")
     assert [grid.ledger(run).status().state for run in grid.manifest().runs()] == ["interrupted"] * 2
     gate.unlink()
     assert rows(finished(start(tmp_path, at_a_time=2), tmp_path)) == reference

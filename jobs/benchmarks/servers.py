@@ -23,6 +23,7 @@ from space_dist.errors import SpaceDistError
 _START_SECONDS = 400.0  # on a busy machine; who gives up sooner begins again from nothing
 _END_SECONDS = 20.0
 _STARTS = 5  # what was killed may hold its ports for a moment, and Ray gives up on a busy machine
+_RESERVED: list[socket.socket] = []  # see `free_ports`
 
 
 class _Server:
@@ -173,13 +174,23 @@ class TrackingServer(_Server):
 
 
 def free_ports(count: int) -> list[int]:
-    """Below Ray's own range for workers. Ray's default ports may be another Ray's."""
+    """Below Ray's own range for workers. Ray's default ports may be another Ray's.
+
+    They are ours for as long as this process lives: nobody else who asks here is given them, though it takes a server
+    seconds to listen at its own.
+    """
     ports: list[int] = []
     while len(ports) < count:
-        with socket.socket() as listening, suppress(OSError):
-            port = 6400 + secrets.randbelow(3000)
-            listening.bind(("127.0.0.1", port))
-            ports.append(port)
+        port, mark = 6400 + secrets.randbelow(3000), socket.socket(socket.AF_UNIX)
+        try:
+            mark.bind(f"\0space-dist-port-{port}")  # in no file system: gone with the last process that has it open
+            with socket.socket() as listening:
+                listening.bind(("", port))  # on any of the machine's addresses, as a server would
+        except OSError:
+            mark.close()
+            continue
+        _RESERVED.append(mark)
+        ports.append(port)
     return ports
 
 
