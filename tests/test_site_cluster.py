@@ -124,7 +124,8 @@ def node(place: Place) -> None:
     gcs, agent = place.ports[0], place.ports[3]
     place.shell.block("ray.md", 1, {"head:6379": f"127.0.0.1:{gcs}"}, f"AGENT={agent}\n{STARTED}")
     asked = f"ray status --address=127.0.0.1:{gcs}"  # Ray brings it up to date every 5 s
-    place.shell.run(f"for time in $(seq 30); do {asked} | tee status.txt; ! grep /12.0 status.txt || break; sleep 1; done")
+    asked = f"{asked} | tee status.txt; ! grep /12.0 status.txt"
+    place.shell.run(f"for time in $(seq 30); do {asked} || break; sleep 1; done")
     assert "/12.0 CPU" in place.shell.said.read_text()
 
 
