@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from space_dist.api.grids import run_grid
+from space_dist.cli.terminal import spread
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.manifest import Manifest, find_grid
 from space_dist.grid.planning import plan
@@ -67,6 +68,39 @@ def test_changes_that_are_refused_are_named(tmp_path: Path, change: str, said: s
     with pytest.raises(ConfigError, match=said):
         plan(path, tmp_path / "runs", 1.0, [change])
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("run g.yaml --set a.b=1 c=2 --root r", "run g.yaml --set a.b=1 --set c=2 --root r"),
+        ("run g.yaml --set a=1 --set b=2 c=3", "run g.yaml --set a=1 --set b=2 --set c=3"),
+        ("run --set a=1 g.yaml h=2", "run --set a=1 g.yaml h=2"),  # behind something else it is nobody's
+        ("run --set a=1 x/y=2", "run --set a=1 x/y=2"),
+        ("run a=1 --scale 0.5 b=2", "run a=1 --scale 0.5 b=2"),
+        ("check --kwarg a=1 b=2", "check --kwarg a=1 --kwarg b=2"),
+        ("run g.yaml --set", "run g.yaml --set"),
+    ],
+)
+def test_several_settings_may_stand_behind_one_option(given: str, meant: str) -> None:
+    assert spread(given.split()) == meant.split()
+
+
+def test_a_file_of_such_a_name_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "g=1.yaml").touch()
+    assert spread(["--set", "a=1", "g=1.yaml", "b=2"]) == ["--set", "a=1", "g=1.yaml", "b=2"]
+
+
+def test_several_settings_reach_a_grid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes, root = ["learner.gamma=0.5", "learner.gae_lambda=0.7"], tmp_path / "runs"
+    path = write_grid(tmp_path)
+    assert command(monkeypatch, "grid", "plan", path, "--set", *changes, "--root", root, "--json") == 0
+    assert find_grid(path, root, 1.0, changes).manifest().changes == tuple(sorted(changes))
+    assert command(monkeypatch, "grid", "plan", path, "learner.gamma=0.5", "--root", root) == 2
+    assert "learner.gamma=0.5" in capsys.readouterr().err
 
 
 def test_a_manifest_knows_its_changes_and_its_threshold(tmp_path: Path) -> None:

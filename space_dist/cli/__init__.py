@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from space_dist.cli.terminal import keep_outputs, say, warn  # isort: skip - before anything heavy
+from space_dist.cli.terminal import keep_outputs, say, spread, warn  # isort: skip - before anything heavy
 
 import os
 import sys
@@ -65,7 +65,7 @@ def main() -> None:
         warn(f"space-dist: {sentence}")
     look_here_too()  # import paths in configs may name the user's own modules
     try:
-        app()
+        app(args=spread(sys.argv[1:]))
     except SpaceDistError as error:
         for line in str(error).splitlines():
             warn(f"space-dist: {line}")

@@ -14,6 +14,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import contextlib
 import errno
 import io
+import itertools
+import re
 import select
 import sys
 from typing import Any
@@ -138,6 +140,8 @@ Kwargs = Annotated[
     ),
 ]
 
+_SETTING = re.compile(r"[A-Za-z_][\w.]*=")  # a path before the `=` has a slash, or is a file's
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -157,6 +161,21 @@ def tell_findings(findings: Findings, checked: str) -> None:
         say(f"note: {note}")
     if findings.faults:
         raise ConfigError("\n".join(one if checked in one else f"{checked}: {one}" for one in findings.faults))
+
+
+def spread(arguments: Sequence[str]) -> list[str]:
+    """A command's arguments, with `--set` before each of several settings behind one: `--set a=1 b=2`, as one types."""
+    spread_out: list[str] = []
+    option = None  # the one whose settings these are, once its first has been seen
+    for before, argument in itertools.pairwise(["", *arguments]):
+        if before in ("--set", "--kwarg"):
+            option = before
+        elif not (_SETTING.match(argument) and not Path(argument).exists()):
+            option = None
+        elif option is not None:
+            spread_out.append(option)
+        spread_out.append(argument)
+    return spread_out
 
 
 def write(path: Path, text: str) -> None:
