@@ -180,7 +180,7 @@ def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, 
     r"""The instances of a CSV file, checked whole.
 
     The first line names `id`, the features of `bounds` and the further `columns`, in any order, and nothing else; each
-    further line is one instance. With `if_there`, `columns` may be missing.
+    further line is one instance. With `if_there`, `columns` may be missing; a feature among them is a feature.
     Cells are separated by commas; spaces around a cell, double quotes around a cell, a byte order mark, `\r\n` and
     blank lines at the end are accepted. Features come back in the order of `bounds`.
 
@@ -189,6 +189,7 @@ def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, 
     feature is not a number within its bounds, a further column not a finite number, or if an id or a context occurs
     twice.
     """
+    columns = [name for name in columns if name not in bounds.names]
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:

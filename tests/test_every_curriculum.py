@@ -43,9 +43,10 @@ KINDS = {
     "learnability": "{kind: learnability, top: 2, every: 2, episodes: 2}",
     "procurl": "{kind: procurl}",
     "procurl_improvement": "{kind: procurl, score: improvement, scale: set}",
-    "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -1, smoothing: 0.5}",
+    "learning_progress": "{kind: learning_progress, outcome: return, lowest_return: -1, largest_return: 1,"
+    " smoothing: 0.5}",
     "plr_positive": "{kind: plr, score: positive_value_loss}",
-    "edge": "{kind: edge, outcome: return, lowest_return: -1}",
+    "edge": "{kind: edge, outcome: return, lowest_return: -1, largest_return: 1}",
     "plr_max_mc": "{kind: plr, score: max_mc}",
     "plr_robust": "{kind: plr, robust: true, temperature: 1, within_update: fixed_chances}",
     "currot": "{kind: currot, delta: 0.5, particles: 12}",

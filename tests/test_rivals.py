@@ -509,6 +509,14 @@ def test_a_manual_order_is_grown_lowest_first_or_highest() -> None:
     assert [len(one) for one in sets(made("{kind: manual, column: effort, growth: add}", train), moving)] == [1, 1, 2]
 
 
+def test_a_manual_order_may_be_a_features() -> None:
+    train = instances(4)
+    [name] = train.names[:1]
+    grown = [sets(made(f"{{kind: manual, column: {name}, reverse: {back}}}", train), [[0.0] * 4] * 4)[3]
+             for back in ("false", "true")]  # fmt: skip
+    assert grown == [[10, 11, 12, 13], [13, 12, 11, 10]]
+
+
 def test_reverse_orders_rank_the_other_way_round() -> None:
     values = [[1.0, 1.0, 1.0, 1.0], [1.0, 1.5, 0.5, 1.25], [1.0, 1.5, 0.5, 1.25]]
     forth = sets(made("{kind: space, eta: 1000}", instances(4)), values)[1]

@@ -275,10 +275,15 @@ class _OutcomeSection(CurriculumSection):
     lowest_return: float = 0.0
     """Of outcome: return: what counts as 0, in reward units."""
     largest_return: float = 1.0
-    """Of outcome: return: what counts as 1, in reward units."""
+    """Of outcome: return, where it must be given: what counts as 1, in reward units."""
 
     @model_validator(mode="after")
     def _rising(self) -> Self:
+        if self.outcome == "return" and "largest_return" not in self.model_fields_set:
+            raise ValueError(
+                "outcome: return needs largest_return, the return that counts as 1 (and lowest_return, which counts as 0, "
+                "where that is not 0): cut off at the default of 1, larger ones would all be alike"
+            )
         if self.lowest_return >= self.largest_return:
             raise ValueError(
                 f"lowest_return: {self.lowest_return:g} must be below largest_return: {self.largest_return:g}"

@@ -148,7 +148,8 @@ class ManualConfig(GrowingConfig):
     kind: Literal["manual"]
     """Which curriculum: a manual order."""
     column: str = Field(min_length=1, max_length=100)
-    """Column of instances.train with one number per instance, of any unit: the lowest come first. Source: ours."""
+    """Column of instances.train with one number per instance, of any unit, or a feature: the lowest come first.
+    Source: ours."""
     growth: Literal["add", "multiply", "schedule"] = "schedule"
     """schedule: S + kappa after every iteration with a gradient step, whatever the values. add: S + kappa when values
     settle. multiply: S * kappa then (kappa of at least 2). Source: ours; as SPaCE's."""

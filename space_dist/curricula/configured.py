@@ -125,7 +125,8 @@ class Makers:
         return self._growing(settings, variants.directed(rank, settings.reverse))
 
     def _manual(self, settings: ManualConfig) -> Space:
-        columns = self._train.columns
+        train = self._train
+        columns = {**dict(zip(train.names, train.contexts.T, strict=True)), **train.columns}
         if settings.column not in columns:
             raise ConfigError(
                 f"curriculum.column: {self._source} was read without a column {settings.column!r}"
@@ -322,6 +323,11 @@ class Makers:
     # ---- anybody's ----
 
     def _custom(self, settings: CustomConfig) -> Custom:
+        if features := [name for name in settings.columns if name in self._train.names]:
+            raise ConfigError(
+                f"curriculum.columns: {features[0]!r} is a feature of the context, which `instances.contexts` holds: "
+                "name other columns"
+            )
         return make_custom(
             settings.import_path, settings.kwargs,
             instances=self._train, seed=self._seed, draws=self._draws, bounds=self._bounds,
