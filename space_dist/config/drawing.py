@@ -281,8 +281,8 @@ class _OutcomeSection(CurriculumSection):
     def _rising(self) -> Self:
         if self.outcome == "return" and "largest_return" not in self.model_fields_set:
             raise ValueError(
-                "outcome: return needs largest_return, the return that counts as 1 (and lowest_return, which counts as 0, "
-                "where that is not 0): cut off at the default of 1, larger ones would all be alike"
+                "outcome: return needs largest_return, the return that counts as 1 (and lowest_return, that of 0, "
+                "where it is not 0): cut off at the default of 1, larger ones would all be alike"
             )
         if self.lowest_return >= self.largest_return:
             raise ValueError(
