@@ -12,6 +12,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import space_dist.learner.unneeded  # noqa: F401 - before anything imports torch
+
+# isort: split
 import torch
 from gymnasium import spaces
 
@@ -35,9 +38,6 @@ from space_dist.learner.on_policy import OnPolicyLearner
 from space_dist.learner.population import PopulationLearner, learn_together, member_bytes, stack_key
 from space_dist.learner.population import refuse as refuse_population
 from space_dist.learner.recurrent import RecurrentLearner
-from space_dist.learner.uncompiled import stand_in
-
-stand_in()  # before the first optimiser
 
 
 def make_learner(

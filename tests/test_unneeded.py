@@ -1,0 +1,85 @@
+"""torch's compiler, and what else training does not need, is imported by who asks for it, and by nobody else."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from tests.patience import PATIENCE
+
+TRAINS = """
+import inspect, sys
+import space_dist.learner
+from space_dist.run.launch import arithmetic_digest
+import torch
+weights = torch.nn.Parameter(torch.ones(3))
+optimizer = torch.optim.SGD([weights], lr=0.5)
+weights.sum().backward()
+optimizer.step()
+optimizer.zero_grad()
+inspect.getmodule(inspect.currentframe())  # looks at every module
+arithmetic_digest()
+generator = torch.Generator().manual_seed(1)
+loaded = [name for name in ("sympy", "torch._decomp", "torch._export", "tensorboard") if name in sys.modules]
+print(weights.tolist(), loaded)
+"""
+COMPILES = """
+import torch._dynamo.config
+print(torch.compile(lambda x: 2 * x + 1, backend="eager")(torch.ones(2)).tolist())
+import torch._dynamo as compiler
+print(compiler.__file__.endswith("__init__.py"), "sympy" in sys.modules)
+optimizer.step()
+"""
+EXPORTS = """
+from torch.export import Dim
+print(Dim("batch").__name__, type(torch.export.export(torch.nn.Linear(2, 1), (torch.ones(1, 2),))).__name__)
+"""
+SHAPES = """
+torch.compiler.is_compiling(), torch.export.Dim
+print(tuple(torch.nn.Conv2d(3, 4, 3, device="meta")(torch.empty(1, 3, 8, 8, device="meta")).shape))
+"""
+LOGS = """
+import tempfile
+from pathlib import Path
+from stable_baselines3.common.logger import configure
+folder = tempfile.mkdtemp()
+logger = configure(folder, ["tensorboard"])
+logger.record("a", 1.0)
+logger.dump(step=1)
+logger.close()
+import torch.utils.tensorboard
+print([file.stat().st_size > 60 for file in Path(folder).iterdir()], torch.utils.tensorboard.SummaryWriter.__module__)
+"""
+GUEST = """
+import sys
+import torch
+import space_dist.sb3
+print("torch._decomp" in sys.modules, torch.export.__file__ is not None)
+"""
+DISABLES = """
+import torch._dynamo
+asked = [torch.compiler.disable(lambda: 1), torch.compiler.disable()(lambda: 2),
+         torch.compiler.disable(recursive=False)(lambda: 3)]
+print([function() for function in asked], "sympy" in sys.modules)
+"""
+
+
+def said(program: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_an_optimiser_imports_no_compiler_and_who_compiles_has_it() -> None:
+    trained = "[0.5, 0.5, 0.5] []"
+    assert said(TRAINS + DISABLES) == [trained, "[1, 2, 3] True"]
+    assert said(TRAINS + COMPILES) == [trained, "[3.0, 3.0]", "True True"]
+
+
+def test_who_exports_or_logs_has_what_it_takes() -> None:
+    assert said(TRAINS + EXPORTS + SHAPES)[1:] == ["batch ExportedProgram", "(1, 4, 6, 6)"]
+    assert said(TRAINS + LOGS)[1:] == ["[True] torch.utils.tensorboard.writer"]
+
+
+def test_a_script_that_imports_torch_has_all_of_it() -> None:
+    assert said(GUEST) == ["True True"]
