@@ -109,7 +109,9 @@ def _meant(folder: Path) -> str:
     else:
         return ""
     first = next(map(str, sorted(file.parent for file in folder.glob("**/status.json"))), "")
-    return f"{what}: space_dist.report_on({str(folder)!r}) reports on them" + (f", Run({first!r}) is one" if first else "")
+    return f"{what}: space_dist.report_on({str(folder)!r}) reports on them" + (
+        f", Run({first!r}) is one" if first else ""
+    )
 
 
 def train(
