@@ -54,7 +54,8 @@ def _benchmarks() -> None:
 
 
 def _end(number: int, _: FrameType | None) -> None:
-    """End as on Ctrl-C: whoever has started processes ends them on the way out."""
+    """End as on Ctrl-C: whoever has started processes ends them on the way out, which a second signal must not stop."""
+    signal.signal(number, signal.SIG_IGN)
     raise SystemExit(128 + number)
 
 

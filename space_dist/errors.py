@@ -23,6 +23,12 @@ class LedgerError(SpaceDistError):
     """A run's folder is damaged, incomplete, or belongs to another configuration."""
 
 
+class NotPlannedError(LedgerError):
+    """The grid or search that a user names was never begun below that root: another command, or root, is meant."""
+
+    exit_code = 2  # 1 would say that runs of it have failed
+
+
 class RunLockedError(SpaceDistError):
     """Another process owns the run."""
 

@@ -458,6 +458,30 @@ def test_a_run_that_cannot_be_read_is_a_failed_one(tmp_path: Path) -> None:
     assert "metrics.jsonl" in report.markdown
 
 
+def test_a_run_on_foreign_instances_is_in_no_number_and_named(tmp_path: Path) -> None:
+    """One was trained on an id that its set does not have; one is on another set than its cell's; the others count."""
+    grid = make_grid(tmp_path / "g", [{"k": 1}, {"k": 2}], n_seeds=3, kind="space")
+    for cell, seed in ((0, 0), (0, 1), (0, 2), (1, 2)):
+        finish(grid, cell, seed, float(1 + seed))
+    odd = start_run(grid.ledger(grid.manifest().run(grid.manifest().cells[1].id, 0)).folder)
+    continue_run(odd, (*START, 50.0), [[0], [0, 77], [0, 78, 79, 80, 81], [0, 1]])
+    other = start_run(grid.ledger(grid.manifest().run(grid.manifest().cells[1].id, 1)).folder, seed=1, n=6)
+    continue_run(other, (*START, 60.0), GROWTH)
+    report = build_grid_report(grid)
+    assert [row["seeds"] for row in report.table] == ["3/3", "1/3"]
+    assert report.table[1]["test return, IQM [95 %]"].startswith("3.00")  # neither 50 nor 60
+    assert report.table[1]["not finished"] == "2 failed: not comparable"
+    assert report.remarks[:2] == [
+        f"In no number: k=2, seed 0: not comparable: iteration 2 was trained on the instance 77, not in "
+        f"{odd.instances('train')}.",
+        "In no number: k=2, seed 1: not comparable: the instances that it was trained on are not those of the grid "
+        "(a.csv).",
+    ]
+    assert "2 runs failed and are in no number: 2 not comparable." in report.markdown
+    assert "| k=2, seed 0 | not comparable |" in report.markdown
+    assert [row["last_test_return"] for row in rows(report.folder / "runs.csv")][3:] == ["", "", "3.0"]
+
+
 def test_returns_of_different_environments_are_never_mixed(tmp_path: Path) -> None:
     """The baseline of the second environment is the first one's counterpart; the third has none."""
     points = [{"env.id": env, "k": k} for env in ("one", "two") for k in (1, 2)] + [{"env.id": "three", "k": 2}]

@@ -26,12 +26,15 @@ from space_dist.api.training import as_config
 from space_dist.config import Mirrors, RunConfig
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.grid.planning import plan
+from space_dist.grid.tuning import plan_search
 from space_dist.ledger import CURRICULUM, METRICS, RunWriter
 from space_dist.run.training import Progress
 from space_dist.tracking.pusher import Pusher
 from tests.commanding import command
+from tests.grids import write_grid
 from tests.patience import PATIENCE
 from tests.test_learners import N_STEPS, config_for, learner_section
+from tests.tunes import write_tune
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/python.md"
@@ -238,6 +241,17 @@ def test_train_does_what_the_command_does(tmp_path: Path, monkeypatch: pytest.Mo
     assert isinstance(run.config, RunConfig)
     with pytest.raises(LedgerError, match="holds no run"):
         space_dist.Run(tmp_path / "nowhere")
+    with pytest.raises(LedgerError, match=r"runs below it: space_dist\.report_on\(.*Run\(.*/called'\) is one"):
+        space_dist.Run(tmp_path)
+
+
+def test_a_grids_folder_is_no_run_and_says_what_reads_it(tmp_path: Path) -> None:
+    folder = plan(write_grid(tmp_path), tmp_path / "runs").grid.folder
+    with pytest.raises(LedgerError, match=r"a grid's, of runs: space_dist\.report_on\("):
+        space_dist.Run(folder)
+    folder = plan_search(write_tune(tmp_path, name="sought"), tmp_path / "runs").grid.folder
+    with pytest.raises(LedgerError, match=r"a search's: `space-dist tune report "):
+        space_dist.Run(folder)
 
 
 def test_a_run_with_a_dashboard_ends_with_where_to_look(

@@ -109,6 +109,41 @@ def test_a_task_goes_back_into_the_queue_only_if_interrupted(
     assert list((tmp_path / "node").iterdir()) == []
 
 
+RAYLESS = """#!/bin/bash
+if [ "$2" = address ]; then
+  echo 127.0.0.1
+elif [ "$1" = grid ]; then
+  [ -z "${STUB_BEGINS:-}" ] || { sleep 0.05; mkdir -p cell/s0; echo begun >cell/s0/status.json; }
+  exit 1
+fi
+"""
+
+
+def test_a_job_whose_ray_never_comes_up_ends_after_a_few_tries(
+    manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+) -> None:
+    """Its nodes' step ends at once each time. A try in which a run began, and a job of another number, count anew."""
+    folder = write(Export(manifest, profile(temp=short), "cluster"), tmp_path / "x")
+    (stubs.folder / "space-dist").unlink()
+    (stubs.folder / "space-dist").write_text(RAYLESS)
+    (stubs.folder / "space-dist").chmod(0o755)
+
+    def tried(**extra: str) -> tuple[int, bool, str]:
+        code, said = stubs.run(folder / TRAIN, **extra)
+        return code, ["scontrol", "requeue", extra.get("SLURM_JOB_ID", "17")] in stubs.calls(), said
+
+    for number, begins in enumerate(("", "", "yes", "", "")):
+        code, requeued, said = tried(STUB_BEGINS=begins, SLURM_RESTART_COUNT=str(number))
+        assert (code, requeued) == (75, True), said
+    assert tried(SLURM_JOB_ID="18")[:2] == (75, True)
+    assert tried(SLURM_JOB_ID="18", SLURM_RESTART_COUNT="1")[:2] == (75, True)
+    code, requeued, said = tried(SLURM_JOB_ID="18", SLURM_RESTART_COUNT="2")
+    assert (code, requeued) == (1, False)
+    assert "3 times in a row Ray did not come up" in said
+    assert not (folder / "ray-tries").exists()
+    assert list((tmp_path / "node").iterdir()) == []
+
+
 def test_a_users_stop_is_respected(manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str) -> None:
     folder = write(Export(manifest, profile(temp=short), "array"), tmp_path / "x")
     (folder / "stop").touch()

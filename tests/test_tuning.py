@@ -27,6 +27,7 @@ from space_dist.grid.tuning import confirmation, plan_search
 from space_dist.report import load_run
 from space_dist.report.objective import over_seeds
 from space_dist.report.search_report import build_search_report
+from tests.commanding import command
 from tests.grids import SMALL, write_grid
 from tests.test_report import continue_run, start_run
 from tests.tunes import ARMS, RATE, ROOT, end, reached, search_of, search_through, write_tune
@@ -128,6 +129,24 @@ def test_every_field_of_a_search_is_explained() -> None:
     for model in seen:
         for name, field in model.model_fields.items():
             assert hasattr(field.annotation, "model_fields") or len(field.description or "") > 10, (model, name)
+
+
+def test_what_was_never_begun_is_the_users_mistake_and_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 1 of `status` would say that runs have failed."""
+    tune, grid = write_tune(tmp_path), write_grid(tmp_path, name="other")
+    for words, said in [
+        (("tune", "status", tune), "tune plan"),
+        (("tune", "report", tune), "tune plan"),
+        (("tune", "confirm", tune), "tune plan"),
+        (("tune", "status", tmp_path), "holds no search"),
+        (("grid", "status", grid), "grid plan"),
+        (("grid", "status", tmp_path), "holds no grid"),
+        (("grid", "status", tmp_path / "manifest.json"), "holds no grid"),
+    ]:
+        assert command(monkeypatch, *words, "--root", tmp_path / "runs") == 2, words
+        assert said in capsys.readouterr().err.replace("\n", " "), words
 
 
 def test_a_search_is_no_grid_and_a_grid_no_search(tmp_path: Path) -> None:

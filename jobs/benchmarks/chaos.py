@@ -112,8 +112,9 @@ def rehearse(
         with contextlib.ExitStack() as stack:
             server = TrackingServer(folder, environment, folder / "server.log")
             head = RayHead(folder / "ray", AT_A_TIME * 2, environment, folder / "head.log")
-            with ThreadPoolExecutor() as pool:
+            with ThreadPoolExecutor() as pool, _ended_at_once(mark, server, head):
                 list(pool.map(stack.enter_context, (server, head)))
+            stack.enter_context(_ended_at_once(mark, server, head))  # on the way out this comes before their own ends
             write = functools.partial(_grid_file, folder, runs, {**settings, "budget.steps": steps}, base)
             alone = stack.enter_context(_alone(folder, write("alone", None), environment))
             rehearsal = _Rehearsal(folder, write("chaos", server.address), head, server, mark, result, say)
@@ -139,6 +140,20 @@ def rehearse(
         else:
             shutil.rmtree(folder, ignore_errors=True)
     return result
+
+
+@contextlib.contextmanager
+def _ended_at_once(mark: str, *servers: RayHead | TrackingServer) -> Iterator[None]:
+    """Where this process is to end (SIGTERM, Ctrl-C), kill all that it has started: what comes next may be SIGKILL."""
+    try:
+        yield
+    except (SystemExit, KeyboardInterrupt):
+        for server in servers:
+            server.give_up()
+        for process in marked(mark):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+        raise
 
 
 def _temporary(folder: Path) -> list[str]:

@@ -35,6 +35,7 @@ class _Server:
     def __init__(self, command: list[str], environment: Mapping[str, str], output: Path) -> None:
         self._command, self._environment, self._output = command, dict(environment), output
         self.process: subprocess.Popen[bytes] | None = None
+        self._given_up = False
 
     def __enter__(self) -> Self:
         self.start()
@@ -46,21 +47,23 @@ class _Server:
         self.end()
 
     def start(self) -> None:
-        """Returns once it answers. Raises SpaceDistError if it does not."""
+        """Returns once it answers. Raises SpaceDistError if it does not, or is given up meanwhile."""
         for _ in range(_STARTS):
+            if self._given_up:
+                raise SpaceDistError(f"{self.name} was given up while it started")
             with self._output.open("ab") as output:
                 self.process = subprocess.Popen(
                     self._command, env=self._environment, start_new_session=True,
                     stdin=subprocess.DEVNULL, stdout=output, stderr=output,
                 )  # fmt: skip
             deadline = time.monotonic() + _START_SECONDS
-            while self.process.poll() is None and time.monotonic() < deadline:
+            while self.process.poll() is None and time.monotonic() < deadline and not self._given_up:
                 with suppress(requests.RequestException):
                     if self.healthy():
                         return
                 time.sleep(0.3)
             self.kill()
-            time.sleep(2.0)
+            time.sleep(0.0 if self._given_up else 2.0)
         raise SpaceDistError(f"{self.name} did not start; what it said is in {self._output}")
 
     def healthy(self) -> bool:
@@ -80,6 +83,10 @@ class _Server:
         if self.process is not None:
             self.process.wait()
         return victims
+
+    def give_up(self) -> None:
+        """For another thread than that of `start`: it need not come up any more."""
+        self._given_up = True
 
     def end(self) -> None:
         """Ask it to end, and kill what does not."""

@@ -13,7 +13,8 @@ from space_dist import config as configs
 from space_dist.api.policies import ActingPolicy, load_policy
 from space_dist.api.progress import line_of_run, shown
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, about
+from space_dist.errors import ConfigError, LedgerError, about
+from space_dist.experiment.manifest import MANIFEST, Grid
 from space_dist.ledger import METRICS, Ledger, Row, Status
 from space_dist.report import draw_learning_curve, load_run
 from space_dist.report.figures import png
@@ -38,7 +39,12 @@ class Run:
     def __init__(self, folder: Path | str, *, tracking_warning: str | None = None) -> None:
         self.ledger = Ledger(folder)
         self.tracking_warning = tracking_warning
-        self.ledger.status()
+        try:
+            self.ledger.status()
+        except LedgerError as error:
+            if instead := _meant(self.folder):
+                raise LedgerError(f"{error}; {instead}") from None
+            raise
 
     def __repr__(self) -> str:
         status = self.status
@@ -90,6 +96,22 @@ class Run:
         """Its learning curve, as notebooks show it; nothing before the first evaluation."""
         found = load_run(self.ledger)
         return png(draw_learning_curve(found)) if len(found.evaluation_steps) else None
+
+
+def _meant(folder: Path) -> str:
+    """What to do with a folder that is no run's, if it is something else of ours; else empty."""
+    if (folder / MANIFEST).is_file():
+        if Grid(folder).manifest().search is not None:
+            return f"it is a search's: `space-dist tune report {folder}` reports on it"
+        what = "it is a grid's, of runs"
+    elif any(folder.glob("*/status.json")):
+        what = "there are runs below it"
+    else:
+        return ""
+    first = next(map(str, sorted(file.parent for file in folder.glob("**/status.json"))), "")
+    return f"{what}: space_dist.report_on({str(folder)!r}) reports on them" + (
+        f", Run({first!r}) is one" if first else ""
+    )
 
 
 def train(

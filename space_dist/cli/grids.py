@@ -222,7 +222,7 @@ def grid_status(
     by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
     address: JobServer = None,
 ) -> None:
-    """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished."""
+    """Where every run stands. Exit codes: 0 complete, 1 failures, 3 unfinished, 2 there is no such grid."""
     from space_dist.experiment.status import exit_code
     from space_dist.slurm.queue import WatchedQueue
 

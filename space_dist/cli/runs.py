@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, say, warn, write
-from space_dist.errors import ConfigError, about, exits_refused
+from space_dist.errors import ConfigError, LedgerError, NotPlannedError, about, exits_refused
 
 if TYPE_CHECKING:
     from space_dist.experiment.manifest import Grid
@@ -222,7 +222,10 @@ def _grid(path: Path, root: Path | None, scale: float, changes: Sequence[str]) -
     from space_dist.experiment.manifest import find_grid
     from space_dist.system.workplace import workplace
 
-    return find_grid(path, workplace() / "runs" if root is None else root, scale, changes)
+    try:
+        return find_grid(path, workplace() / "runs" if root is None else root, scale, changes)
+    except NotPlannedError as error:  # 1, as where there are no runs: here 1 does not stand for failed runs
+        raise LedgerError(str(error)) from None
 
 
 def print_report(result: Report, to: Console) -> None:

@@ -122,7 +122,7 @@ def tune_status(
     as_json: Json = False,
     by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
 ) -> None:
-    """Where every trial stands. Exit codes: 0 over, 1 held up by failures, 3 unfinished."""
+    """Where every trial stands. Exit codes: 0 over, 1 held up by failures, 3 unfinished, 2 there is no such search."""
     from space_dist.experiment.tuning import find_tune
     from space_dist.slurm.queue import WatchedQueue
 

@@ -25,7 +25,7 @@ from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
 from space_dist.config import NAME, Mirrors, Patience, ResourcesConfig, RunConfig, Section
-from space_dist.errors import ConfigError, LedgerError, nearest
+from space_dist.errors import ConfigError, LedgerError, NotPlannedError, nearest
 from space_dist.experiment import scaling
 from space_dist.experiment.search import Search
 from space_dist.ledger import Ledger, owner_alive
@@ -494,7 +494,7 @@ class Grid:
             with self.manifest_file.open("rb") as file:
                 content = file.read(_MAX_MANIFEST_BYTES + 1)
         except FileNotFoundError:
-            raise LedgerError(f"{self.folder} holds no grid: it has no {MANIFEST}") from None
+            raise NotPlannedError(f"{self.folder} holds no grid: it has no {MANIFEST}") from None
         except OSError as error:
             raise LedgerError(f"{self.manifest_file} cannot be read: {error.strerror}") from None
         if len(content) > _MAX_MANIFEST_BYTES:
@@ -565,7 +565,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
     `root`, at a scale and with changes).
 
     Raises ConfigError if there is nothing of the kind, and for a scale or changes of what is frozen already;
-    LedgerError if a YAML file's grid was never frozen.
+    NotPlannedError if a YAML file's grid was never frozen.
     """
     if not path.exists() and len(path.parts) == 1 and Grid(root / path).manifest_file.exists():
         path = root / path
@@ -575,7 +575,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
         raise ConfigError(f"{path} is frozen already, with its settings; --set is for a grid's YAML file")
     if path.is_dir():
         if not (path / MANIFEST).exists():
-            raise LedgerError(f"{path} holds no grid: it has no {MANIFEST}")
+            raise NotPlannedError(f"{path} holds no grid: it has no {MANIFEST}")
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
@@ -586,7 +586,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
     if not grid.manifest_file.exists():
         small = "" if scale == scaling.WHOLE else f" --scale {scale:g}"
         small += "".join(f" --set {shlex.quote(change)}" for change in changes)
-        raise LedgerError(
+        raise NotPlannedError(
             f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}{small}` freezes it there "
             "(--root names another root)"
         )

@@ -17,8 +17,8 @@ from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
 from space_dist.config import NAME, Section
-from space_dist.errors import ConfigError, LedgerError, nearest
-from space_dist.experiment.manifest import MAX_RUNS, Grid, GridTracking, Retry, RunResources, SeedRange
+from space_dist.errors import ConfigError, NotPlannedError, nearest
+from space_dist.experiment.manifest import MANIFEST, MAX_RUNS, Grid, GridTracking, Retry, RunResources, SeedRange
 
 MAX_TRIALS = 10_000  # of an arm
 _MAX_CHOICES = 1000
@@ -474,12 +474,12 @@ def put(data: dict[str, Any], key: str, value: Any, folder: Path) -> None:
 def find_tune(path: Path, root: Path) -> Grid:
     """The search that a user names: its folder, or its YAML file (planned below `root`).
 
-    Raises ConfigError if the path names no search, LedgerError if a YAML file's search was never planned.
+    Raises ConfigError if the path names no search, NotPlannedError if a YAML file's search was never planned.
     """
     grid = Grid(path) if path.is_dir() else Grid(root / load_tune(path).name)
     if not grid.manifest_file.exists():
-        raise LedgerError(
-            f"{grid.folder} holds no search" if path.is_dir() else
+        raise NotPlannedError(
+            f"{grid.folder} holds no search: it has no {MANIFEST}" if path.is_dir() else
             f"the search of {path} is not in {grid.folder}: `space-dist tune plan {path}` plans it there "
             "(--root names another root)"
         )  # fmt: skip

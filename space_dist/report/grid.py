@@ -6,8 +6,10 @@ baseline's counterpart there. Returns of different tasks are never pooled or com
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import hashlib
 import json
 import math
 from collections import Counter
@@ -24,7 +26,7 @@ from space_dist.experiment.endings import Evidence, why_ended
 from space_dist.experiment.manifest import Cell, Grid, Manifest
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.report.figures import HeatMap
-from space_dist.report.load import Configuration, FloatArray, Run, load_run
+from space_dist.report.load import SPLITS, Configuration, FloatArray, Run, load_run
 from space_dist.report.statistics import (
     Interval,
     Reach,
@@ -40,6 +42,7 @@ from space_dist.report.tables import Summary, finals, summarise
 
 MAX_MAPS: Final = 24
 MAX_POOLED: Final = 200  # settings of which cells are pooled
+NOT_COMPARABLE: Final = "not comparable"
 MAX_NAMED: Final = 12  # runs that a sentence names
 
 
@@ -104,13 +107,21 @@ class Comparison:
 
 
 def read_cells(grid: Grid, manifest: Manifest) -> list[CellRuns]:
-    """Every cell with its runs, in the manifest's order. A run that cannot be read is a failed one that says why."""
+    """Every cell with its runs, in the manifest's order.
+
+    A run that cannot be read, or is on other instances than its cell's, is a failed one that says why.
+    """
+    read = [_read(run_status) for run_status in run_statuses(grid, manifest, manifest.code)]
+    strangers = _not_comparable([(known.run.cell, run) for run, known in read if run is not None], manifest)
     by_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
     runs: dict[str, list[Run]] = {cell.id: [] for cell in manifest.cells}
-    for run_status in run_statuses(grid, manifest, manifest.code):
-        run, known = _read(run_status)
-        by_cell[run_status.run.cell.id].append(known)
-        runs[run_status.run.cell.id] += [] if run is None else [run]
+    for run, told in read:
+        known = told
+        reason = None if run is None else strangers.get(run.ledger.folder)
+        if reason is not None:  # nothing of it has ended badly, so there is no cause
+            known = dataclasses.replace(known, condition="failed", cause=None, detail=f"{NOT_COMPARABLE}: {reason}")
+        by_cell[known.run.cell.id].append(known)
+        runs[known.run.cell.id] += [] if run is None or reason is not None else [run]
     labels = _labels(manifest.cells)
     configurations = [
         Configuration(labels[cell.id], tuple(runs[cell.id]), len(manifest.seeds_of(cell)) - len(runs[cell.id]))
@@ -144,6 +155,36 @@ def _read(run_status: RunStatus) -> tuple[Run | None, RunStatus]:
     if run.finished and run_status.condition != "done":  # since we looked
         run_status = dataclasses.replace(run_status, condition="done", cause=None, detail="", steps=run.status.steps)
     return run, run_status
+
+
+def _not_comparable(runs: Sequence[tuple[Cell, Run]], manifest: Manifest) -> dict[Path, str]:
+    """The folders of runs whose numbers are none of their cells', each with why: they are on other instances."""
+    reasons: dict[Path, str] = {}
+    for split in SPLITS:
+        digests: dict[str, dict[Path, str]] = {}  # by the grid's file: of each run's own copy
+        for cell, run in runs:
+            of_file = digests.setdefault(cell.config["instances"][split], {})
+            with contextlib.suppress(LedgerError):  # a copy that is lost says nothing
+                of_file[run.ledger.folder] = hashlib.sha256(run.ledger.read(run.ledger.instances(split))).hexdigest()
+        for file, found in digests.items():
+            if len(counts := Counter(found.values())) < 2:
+                continue
+            frozen = manifest.instances.get(Path(file).name)
+            right = frozen if frozen in counts else counts.most_common(1)[0][0]
+            reasons |= {
+                folder: f"the instances that it was {'trained' if split == 'train' else 'tested'} on are not those of "
+                f"the grid ({file})"
+                for folder, digest in found.items()
+                if digest != right
+            }
+    for _, run in runs:
+        if run.foreign is not None:
+            iteration, ids = run.foreign
+            some = ", ".join(map(str, ids[:3].tolist())) + (f" and {len(ids) - 3} more" if len(ids) > 3 else "")
+            which = "the instance" if len(ids) == 1 else "the instances"
+            own = run.ledger.instances("train")
+            reasons[run.ledger.folder] = f"iteration {iteration} was trained on {which} {some}, not in {own}"
+    return reasons
 
 
 def _labels(cells: Sequence[Cell]) -> dict[str, str]:
@@ -347,9 +388,25 @@ def failures(cells: Sequence[CellRuns]) -> list[tuple[CellRuns, RunStatus]]:
     ]
 
 
+def cause_in_words(run_status: RunStatus) -> str:
+    """Why a run that has failed is in no number."""
+    if run_status.cause is not None:
+        return run_status.cause.in_words
+    return NOT_COMPARABLE if not_comparable(run_status) else "unknown"
+
+
+def not_comparable(run_status: RunStatus) -> bool:
+    """Whether it is on other instances than its cell's, see `read_cells`."""
+    return run_status.condition == "failed" and run_status.detail.startswith(NOT_COMPARABLE)
+
+
 def missing(cell: CellRuns) -> str:
     """Which runs of a cell are not counted, and why: `1 failed: out of memory, 2 waiting`."""
-    counts = Counter(run_status.in_words for run_status in cell.run_statuses if run_status.condition != "done")
+    counts = Counter(
+        f"{run_status.condition}: {NOT_COMPARABLE}" if not_comparable(run_status) else run_status.in_words
+        for run_status in cell.run_statuses
+        if run_status.condition != "done"
+    )
     return ", ".join(f"{count} {words}" for words, count in counts.items())
 
 

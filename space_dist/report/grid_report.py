@@ -26,6 +26,7 @@ from space_dist.report.figures import COLOURS, HeatMap, Panel, draw_comparison, 
 from space_dist.report.grid import (
     CellRuns,
     Comparison,
+    cause_in_words,
     compare,
     coupled_remarks,
     failures,
@@ -33,6 +34,7 @@ from space_dist.report.grid import (
     grouped,
     heat_maps,
     missing,
+    not_comparable,
     pool,
     read_cells,
     run_folder,
@@ -238,7 +240,11 @@ def _summary(
 
 
 def _remarks(manifest: Manifest, cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[str]:
-    lines = fingerprint_remarks(cells, manifest) + coupled_remarks(cells)
+    strange = [(cell, one) for cell, one in failures(cells) if not_comparable(one)]
+    lines = [
+        f"In no number: {cell.label}, seed {one.run.seed}: {clean(one.detail)}." for cell, one in strange[:MAX_LISTED]
+    ]
+    lines += fingerprint_remarks(cells, manifest) + coupled_remarks(cells)
     if alone := [cell.label for cell, comparison in zip(cells, compared, strict=True) if comparison.reference is None]:
         shown = ", ".join(alone[:MAX_LISTED]) + (", ..." if len(alone) > MAX_LISTED else "")
         lines.append(f"Not compared, for their environment or test set has no counterpart of the baseline: {shown}.")
@@ -341,7 +347,7 @@ def _failed(cells: Sequence[CellRuns]) -> list[Section]:
     found = failures(cells)
     if not found:
         return []
-    causes = Counter(run_status.cause.in_words if run_status.cause else "unknown" for _, run_status in found)
+    causes = Counter(cause_in_words(run_status) for _, run_status in found)
     text = [f"{len(found):,} run{'s' if len(found) > 1 else ''} failed and "
             f"{'are' if len(found) > 1 else 'is'} in no number: "
             + ", ".join(f"{count:,} {cause}" for cause, count in causes.most_common()) + "."]  # fmt: skip
@@ -354,7 +360,7 @@ def _failed(cells: Sequence[CellRuns]) -> list[Section]:
         rows.append(
             {
                 "run": title,
-                "cause": run_status.cause.in_words if run_status.cause else "unknown",
+                "cause": cause_in_words(run_status),
                 "what it said": lines[0] or NONE,
                 "steps": f"{run_status.steps:,} of {run_status.budget_steps:,}",
                 "attempts": str(run_status.attempts),

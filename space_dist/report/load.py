@@ -25,6 +25,7 @@ IntArray = NDArray[np.int64]
 Split = Literal["test", "train"]
 
 MEASURES: Final = ("return", "discounted_return", "length", "success")
+_GENERATED: Final = -1  # the id of every context that was generated
 SPLITS: Final[tuple[Split, ...]] = ("test", "train")
 
 
@@ -37,7 +38,8 @@ class Run:
     where there is no such number. `iteration_ends` `(m,)` are real environment steps, `set_sizes` `(m,)` how many
     instances each iteration was trained on. `generates_contexts`: some contexts it was trained on are not of the
     instance set (their id is -1). `all_instances_reached_at`: the real step from which the run was first trained on
-    all its instances; None if it never was.
+    all its instances; None if it never was. `foreign`: the first iteration, counted from 1, with the ids that it was
+    trained on and that no instance of its has; None where there is no such iteration.
     """
 
     ledger: Ledger
@@ -51,6 +53,7 @@ class Run:
     set_sizes: IntArray
     generates_contexts: bool
     all_instances_reached_at: int | None
+    foreign: tuple[int, IntArray] | None = None
 
     def until(self, steps: int) -> Run:
         """The run as if its budget had ended with the first evaluation at or behind so many steps.
@@ -257,6 +260,7 @@ def load_run(ledger: Ledger, config: Mapping[str, Any] | None = None) -> Run:
         set_sizes=np.array([_size(ids) for ids in trained], dtype=np.int64),
         generates_contexts=any(bool((ids < 0).any()) for ids in trained),
         all_instances_reached_at=_all_reached_at(instance_ids, _starts(ends), trained),
+        foreign=_foreign(instance_ids, trained),
     )  # fmt: skip
 
 
@@ -287,6 +291,14 @@ def _all_reached_at(instance_ids: IntArray, starts: IntArray, trained: Sequence[
     for start, ids in zip(starts.tolist(), trained, strict=True):
         if len(ids) >= everything and len(np.unique(ids[ids >= 0])) == everything:
             return int(start)
+    return None
+
+
+def _foreign(instance_ids: IntArray, trained: Sequence[IntArray]) -> tuple[int, IntArray] | None:
+    for number, ids in enumerate(trained, start=1):
+        own = np.isin(ids, instance_ids) | (ids == _GENERATED)
+        if not own.all():
+            return number, np.unique(ids[~own])
     return None
 
 

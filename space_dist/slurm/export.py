@@ -33,6 +33,7 @@ NEXT = "slurm_next.txt"  # in a search's folder: what is to be submitted next, w
 JOBS = "slurm_jobs.txt"  # in the grid's folder: `<job id> <what it is>` a line, of the last submission
 _MAX_ARRAYS = 1000
 _CHECKPOINT_SECONDS = 10  # beside the grace time: to notice the signal, and to get back into the queue
+_RAY_TRIES = 3  # in a row, without a run that began: then what keeps Ray from coming up will not go away by itself
 _PLAIN = re.compile(r"[A-Za-z0-9@%+,.:/_-]+")
 
 
@@ -328,7 +329,8 @@ def _values(grid: Export) -> dict[str, Any]:
         "root": None if grid.root is None else str(grid.root), "log_folders": grid.log_folders(),
         "jobs": JOBS, "next": NEXT,
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
-        "max_requeues": profile.max_requeues, "stop_seconds": round(manifest.resources.grace_seconds) + 60,
+        "max_requeues": profile.max_requeues, "ray_tries": _RAY_TRIES,
+        "stop_seconds": round(manifest.resources.grace_seconds) + 60,
         "sync": manifest.tracking.anywhere,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
         "env": {_Safe(name): value for name, value in profile.env.items()},
