@@ -226,6 +226,26 @@ def test_a_checkpoint_restores_it_bit_for_bit(env_id: str) -> None:
     resumed_to_the_bit(small(update="lean", learning_rate_schedule="linear"), env_id)
 
 
+def test_it_goes_on_from_whatever_takes_the_place_of_its_tensors() -> None:
+    fresh, used = (learner_for(small(update="lean"), LINE) for _ in range(2))
+    shards = [shards_of(fresh, LINE, round=number) for number in range(3)]
+    for number in range(2):
+        fresh.update(shards[number], round=number, steps=(number + 1) * 96)
+    for number in range(3):  # other shards, so that other numbers stand where SB3's tensors were
+        used.update(shards[2 - number], round=number, steps=(number + 1) * 96)
+    used.load(*fresh.save())
+    for parameter in used.model.policy.parameters():
+        parameter.data = parameter.data.clone()
+    saved = state(fresh)
+    for learner in (fresh, used):
+        learner.update(shards[2], round=2, steps=288)
+    ours, theirs = state(used), state(fresh)
+    assert ours.keys() == theirs.keys()
+    for name, array in theirs.items():
+        np.testing.assert_array_equal(ours[name], array, err_msg=name)
+        assert not np.array_equal(saved[name], array), name
+
+
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])
 def test_stock_and_lean_go_on_from_each_others_checkpoints(env_id: str) -> None:
     learners = [learner_for(small(update=kind), env_id) for kind in ("stock", "lean")]

@@ -370,8 +370,10 @@ def backward(m: Any, plan: Any, layers: Any, network: int, count: int) -> None:
                 for part in range(inputs // lanes):
                     at = to + part * lanes * lanes
                     start, row, jump = (at, lanes, strip) if sample else (plan.zeros_at, 0, 0)
+                    # Weights of inputs that there are none of have no gradient: theirs stays the zero that it is.
                     _products(
-                        m, at, strip, some, lanes, start, row, jump, below_at + part * panel + sample * lanes,
+                        m, at, strip, some, min(lanes, padded(n_in - part * lanes, _ROWS)), start, row, jump,
+                        below_at + part * panel + sample * lanes,
                         1, lanes, 0, steps, given + sample * lanes, panel, steps,
                     )  # fmt: skip
         for part in range(units // lanes):
@@ -484,10 +486,19 @@ def _outputs_below(m: Any, plan: Any, layers: Any, network: int) -> None:
     inputs = padded(n_in, lanes)
     if plan.depth:
         for part in range(inputs // lanes):
-            for row in range(rows):
+            for row in range(0, rows, 4):  # four at a time: a sum waits for its last addition
                 at = below_at + (part * rows + row) * lanes
-                found = _given(m, weights_at + part * lanes, inputs, gradient_at + row, rows, n_out)
-                store(m, at, _through(plan, found, load(m, at)))
+                one = two = three = four = every(m, 0.0)
+                for output in range(n_out):
+                    weights = load(m, weights_at + output * inputs + part * lanes)
+                    given = gradient_at + output * rows + row
+                    one, two = fma(every(m, m[given]), weights, one), fma(every(m, m[given + 1]), weights, two)
+                    three = fma(every(m, m[given + 2]), weights, three)
+                    four = fma(every(m, m[given + 3]), weights, four)
+                store(m, at, _through(plan, one, load(m, at)))
+                store(m, at + lanes, _through(plan, two, load(m, at + lanes)))
+                store(m, at + 2 * lanes, _through(plan, three, load(m, at + 2 * lanes)))
+                store(m, at + 3 * lanes, _through(plan, four, load(m, at + 3 * lanes)))
 
 
 @compiled

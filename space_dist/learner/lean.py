@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +26,7 @@ from space_dist.kernels.ppo import CLIPPED, DIVERGENCE, ENTROPY, N_RECORDED, POL
 
 Array = NDArray[np.floating[Any]]
 _ROWS = 64  # samples that are evaluated together; no result depends on it
+_PARTS = (0, 2, 3)  # of a layout's parameters, gradients, means and squares: those that outlive an update
 
 
 class LeanBuffer(RolloutBuffer):
@@ -123,13 +123,22 @@ class Report:
 
 
 class Network:
-    """An SB3 policy, and its optimiser's memory, laid out for the kernel; SB3's own stay the truth."""
+    """An SB3 policy, and its optimiser's memory, laid out for the kernel; SB3's own stay the truth.
+
+    SB3's tensors are views of one array here, `(3, n)` weights and Adam's means and squares, so that all numbers go to
+    the kernel and back at once.
+    """
 
     def __init__(self, policy: Any) -> None:
         self._policy, (self._names, self._parameters) = policy, zip(*policy.named_parameters(), strict=True)
-        self._sizes = [parameter.numel() for parameter in self._parameters]
         weight = policy.action_net.weight
         self._dtype, self._shape = weight.detach().numpy().dtype, shape_of(policy)
+        sizes = [parameter.numel() for parameter in self._parameters]
+        self._numbers = np.zeros((3, sum(sizes)), dtype=self._dtype)
+        self._weights, self._means, self._squares = (
+            [part.view_as(parameter) for part, parameter in zip(torch.split(row, sizes), self._parameters, strict=True)]
+            for row in torch.from_numpy(self._numbers)
+        )
 
     def packed(
         self, observations: Array, actions: NDArray[Any], log_probs: Any = 0.0, advantages: Any = 0.0,
@@ -149,15 +158,12 @@ class Network:
     def update(self, samples: Array, orders: NDArray[np.int64], size: int, settings: Settings) -> Report:
         """Learn from the epochs' (epochs, n) permutations of samples in minibatches of `size`."""
         n = len(samples)
-        layout = self._layout(min(size, n))
-        places, state = layout.all_places(self._names), self._policy.optimizer.state
-        steps = max((int(one["step"]) for one in state.values()), default=0)
+        layout, steps = self._layout(min(size, n)), self._gather()
+        places = layout.all_places(self._names)
         m = aligned(layout.size, self._dtype)
         parts = m[: 4 * layout.plan.length].reshape(4, -1)
-        parts[0, places] = joined(self._parameters)
-        if state:
-            for part, moment in ((parts[2], "exp_avg"), (parts[3], "exp_avg_sq")):
-                part[places] = joined([state[parameter][moment] for parameter in self._parameters])
+        for part, numbers in zip(_PARTS, self._numbers, strict=True):
+            parts[part, places] = numbers
         recorded = np.zeros((len(orders) * -(-n // size), N_RECORDED))
         done, made, epochs = prepare(self._dtype).update(
             m, layout.plan, layout.layers, settings._replace(steps=steps), samples.ravel(), orders, size, recorded
@@ -165,36 +171,51 @@ class Network:
         self._keep(layout, parts, steps + made)
         return Report(recorded[:done], epochs, (epochs - 1) * -(-n // size))
 
+    def _gather(self) -> int:
+        """Have the array hold SB3's numbers, whoever has put other tensors in the place of its views.
+
+        Returns the steps that Adam has made.
+        """
+        self._gather_weights()
+        state = self._policy.optimizer.state
+        if not state:
+            self._numbers[1:] = 0.0
+        for parameter, mean, square in zip(self._parameters, self._means, self._squares, strict=True):
+            if state and state[parameter]["exp_avg"] is not mean:  # as after a checkpoint was loaded
+                mean.copy_(state[parameter]["exp_avg"])
+                square.copy_(state[parameter]["exp_avg_sq"])
+        return max((int(one["step"]) for one in state.values()), default=0)
+
+    def _gather_weights(self) -> None:
+        for parameter, weight in zip(self._parameters, self._weights, strict=True):
+            if parameter.data_ptr() != weight.data_ptr():
+                weight.copy_(parameter.detach())
+                parameter.data = weight
+
     def _keep(self, layout: Layout, parts: Array, steps: int) -> None:
-        """Give policy and optimiser their numbers."""
-        numbers = parts[:, layout.all_places(self._names)]
-        weights, _, means, squares = (torch.split(torch.from_numpy(part), self._sizes) for part in numbers)
-        with torch.no_grad():
-            for parameter, weight, mean, square in zip(self._parameters, weights, means, squares, strict=True):
-                parameter.copy_(weight.view_as(parameter))
-                self._policy.optimizer.state[parameter] = {
-                    # As torch's Adam keeps it, so that a stock run can go on from a lean one's checkpoint.
-                    "step": torch.tensor(float(steps)),
-                    "exp_avg": mean.view_as(parameter), "exp_avg_sq": square.view_as(parameter),
-                }  # fmt: skip
+        """Give policy and optimiser their numbers, and the views of Adam's."""
+        places = layout.all_places(self._names)
+        for part, numbers in zip(_PARTS, self._numbers, strict=True):
+            np.take(parts[part], places, out=numbers)
+        for parameter, mean, square in zip(self._parameters, self._means, self._squares, strict=True):
+            # As torch's Adam keeps it, so that a stock run can go on from a lean one's checkpoint.
+            self._policy.optimizer.state[parameter] = {
+                "step": torch.tensor(float(steps)), "exp_avg": mean, "exp_avg_sq": square,
+            }  # fmt: skip
 
     def evaluate(self, samples: Array) -> tuple[Array, Array]:
         """`(n, record) -> (n,), (n,)`: values, and the actions' log-probabilities."""
         n = len(samples)
         layout = self._layout(_ROWS)
         m = aligned(layout.size, self._dtype)
-        m[layout.all_places(self._names)] = joined(self._parameters)
+        self._gather_weights()
+        m[layout.all_places(self._names)] = self._numbers[0]
         found = np.zeros((n, layout.plan.outputs), self._dtype), np.zeros(n, self._dtype), np.zeros(n, self._dtype)
         prepare(self._dtype).evaluate(m, layout.plan, layout.layers, samples.ravel(), np.arange(n), *found)
         return found[1:]
 
     def _layout(self, rows: int) -> Layout:
         return Layout.of(self._shape, rows, self._dtype.itemsize)
-
-
-def joined(tensors: Sequence[torch.Tensor]) -> Array:
-    """All their numbers, one after another."""
-    return np.concatenate([tensor.detach().numpy().ravel() for tensor in tensors])
 
 
 def shape_of(policy: Any) -> Shape:

@@ -21,7 +21,7 @@ from torch import nn
 
 from space_dist.kernels import aligned, dqn, sac, td3
 from space_dist.kernels.replay import Algorithm, ReplayLayout, ReplayShape
-from space_dist.learner.lean import Array, joined
+from space_dist.learner.lean import Array
 
 _NUMBERS = 1 << 20  # of samples that are drawn together, about; no result depends on it
 
@@ -253,3 +253,8 @@ class LeanSAC(SAC):
 
 
 LEAN: dict[str, Any] = {"dqn": LeanDQN, "td3": LeanTD3, "sac": LeanSAC}
+
+
+def joined(tensors: Sequence[torch.Tensor]) -> Array:
+    """All their numbers, one after another."""
+    return np.concatenate([tensor.detach().numpy().ravel() for tensor in tensors])

@@ -206,16 +206,19 @@ class _Workshop:
             batches[promise.batch].append(promise)
         for batch, promised in batches.items():
             # In the same order every round, whoever was answered first: else episodes would be played again.
-            for some in _parts(sorted(promised, key=lambda promise: promise.shard_key or ("", 0))):
+            for number, some in enumerate(_parts(sorted(promised, key=lambda promise: promise.shard_key or ("", 0)))):
                 try:
                     with exits_refused():
-                        self._compute(batch, some)
+                        self._compute(batch, some, number)
                 except Exception:  # somebody's environment may raise anything: whose was it?
                     self._compute_apart(batch, some)
 
-    def _compute(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
+    def _compute(self, batch: Hashable, promised: Sequence[_Promise], number: int = 0) -> None:
+        """number: of these among the parts of a batch."""
         setup, works = promised[0].setup, [promise.work for promise in promised]
-        key = (batch, sum(promise.slots for promise in promised))
+        # A part of its own environments: an evaluation plays the same episodes as the one before it, and what an
+        # environment has drawn for an episode it need not draw again.
+        key = (batch, sum(promise.slots for promise in promised), number % _KEPT)
         values: Sequence[Any]
         if rollouts := [work for work in works if isinstance(work, Rollout)]:
             values = collect(self._stage(key, promised), rollouts, length=setup.slot_length)
