@@ -42,6 +42,8 @@ class Unfinished:
 
     def same(self, other: Unfinished | None) -> bool:
         """Whether both are the same to the bit."""
+        if self is other:  # as whoever goes on at once is handed back what it gave
+            return True
         if other is None or (self.memory is None) != (other.memory is None):
             return False
         return all(
