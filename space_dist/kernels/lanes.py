@@ -147,7 +147,8 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
         place = builder.bitcast(_pointer(context, builder, signature.args[0], *values), cgutils.voidptr_t)
         number = ir.IntType(32)
         function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number]),
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number]),
             "llvm.prefetch.p0",
         )
         builder.call(function, [place, *(ir.Constant(number, value) for value in (0, 3, 1))])  # to read, keep, data
