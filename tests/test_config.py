@@ -19,6 +19,7 @@ from ruamel.yaml import YAML
 
 from space_dist import config as configs
 from space_dist.config import RunConfig, dump, identity, load, schema
+from space_dist.config.plain_yaml import to_yaml
 from space_dist.errors import ConfigError
 from tests.config_texts import Raw, leaves, replaced
 
@@ -107,6 +108,13 @@ def kinds(section: str) -> list[str]:
 
 
 # ---- what is accepted -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_of_a_config_is_all_of_it_whatever_was_written_before() -> None:
+    for overrides in ([], ["fork={seed: 0, steps: 5}"], ["budget.steps=30000"]):
+        for seed in (3, 0, 41):
+            config = load(SPACE, overrides, seed=seed)
+            assert dump(config) == to_yaml(config.model_dump(mode="json"))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

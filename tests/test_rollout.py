@@ -214,6 +214,10 @@ def test_actions_are_clipped_as_stable_baselines3_clips_them() -> None:
         head.executed(actions), np.float32([[-1.0, -2.0], [0.5, 4.0], [0.1, 0.2], [0.5, -2.0]])
     )
     np.testing.assert_array_equal(actions, given)
+    head = Head("gaussian", np.zeros(2, np.float32), np.float32([-1.0, -1.0]), np.float32([2.0, 2.0]))
+    alike = head.executed(actions)
+    np.testing.assert_array_equal(alike, np.float32([[-1.0, -1.0], [0.6, 2.0], [0.1, 0.2], [2.0, -1.0]]))
+    assert alike.dtype == np.float32
     np.testing.assert_array_equal(Head("categorical").executed(np.array([0, 2, 1])), [0, 2, 1])
 
 

@@ -30,9 +30,9 @@ from space_dist.learner.normaliser import _discounted
 from space_dist.ledger import METRICS, Ledger
 from space_dist.rollout import Rollout, Setup, Shard, Stage, Worker, collect, collecting
 from space_dist.rollout.episodes import rounds_over
-from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
+from space_dist.rollout.walk import Unfinished, Walk, Walking, stacked, unstacked
 from space_dist.run.launch import launch
-from space_dist.seeding import Purpose, generator
+from space_dist.seeding import Purpose, episode_seeds, generator
 from space_dist.system.interrupts import StopRequests
 from tests.test_learner import Ignore
 from tests.test_learners import config_for, learner_section
@@ -68,6 +68,18 @@ def going_on(one: Setup, worker: Any, rounds: int = ROUNDS) -> list[list[Shard]]
         )
         told.append(shards)
     return told
+
+
+def test_an_episodes_seed_hangs_on_its_number_alone() -> None:
+    """However many are drawn with it, and however many more its slot turns out to begin."""
+    rollouts = [
+        Rollout(falling(), selection_in(0), start=0, gamma=1.0, seed=3, round=5, shard=shard) for shard in (0, 2)
+    ]
+    walking, slots = Walking(rollouts, 4), np.array([0, 2, 3, 4, 7])  # three of the first's, two of the second's
+    seeds = [walking.next(slots)[2] for _ in range(40)]
+    for mine, shard in ((slice(3), 0), (slice(3, 5), 2)):
+        told = np.concatenate([one[mine] for one in seeds])
+        np.testing.assert_array_equal(told, episode_seeds(3, Purpose.EPISODES, 5, shard, count=len(told)))
 
 
 # ---- whoever goes on ----

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +19,7 @@ from space_dist.errors import ConfigError
 
 _M = TypeVar("_M", bound=BaseModel)
 _CREDENTIALS = re.compile(r"//[^/\s]*@")
+_SEED = re.compile(r"^seed: 0$", re.MULTILINE)  # a run's own: those of sections do not begin a line
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
@@ -84,7 +87,14 @@ def check(model: type[_M], data: Mapping[str, Any], source: str, origins: Mappin
 
 def dump(config: RunConfig) -> str:
     """The resolved config as YAML, every default written out."""
-    return to_yaml(config.model_dump(mode="json"))
+    data = config.model_dump(mode="json")
+    # Only this line tells a cell's runs apart, and a population writes down as many as it has members.
+    return _SEED.sub(f"seed: {data['seed']}", _text(json.dumps({**data, "seed": 0})), count=1)
+
+
+@functools.lru_cache(maxsize=32)
+def _text(data: str) -> str:
+    return to_yaml(json.loads(data))
 
 
 def put(data: dict[str, Any], key: str, value: Any, where: str) -> None:

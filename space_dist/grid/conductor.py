@@ -153,7 +153,7 @@ class Conductor:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
         self._begin()
         looked = time.monotonic()
-        while self._interrupted or self._fresh or self._live or self._elsewhere:
+        while self._is_left():
             for run, ended in self._executor.poll():
                 self._settle(run, ended)
             if reason := self._asked_to_stop():
@@ -165,9 +165,14 @@ class Conductor:
                     self._enqueue(run)
                     self._end_if_abandoned(run)
             self._show()
-            time.sleep(_TICK_SECONDS)
+            if self._is_left():
+                time.sleep(_TICK_SECONDS)
         self._show()
         return self.run_statuses()
+
+    def _is_left(self) -> bool:
+        """Whether any run is not at its end."""
+        return bool(self._interrupted or self._fresh or self._live or self._elsewhere)
 
     def run_statuses(self) -> list[RunStatus]:
         """Where all runs stand now, by their files."""

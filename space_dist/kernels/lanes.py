@@ -140,6 +140,24 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
+def prefetch(typing: Any, array: Any, index: Any) -> Any:
+    """Have the cache fetch the line of `array[index]`, which is read soon. Changes nothing else."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        place = builder.bitcast(_pointer(context, builder, signature.args[0], *values), cgutils.voidptr_t)
+        number = ir.IntType(32)
+        function = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number]),
+            "llvm.prefetch.p0",
+        )
+        builder.call(function, [place, *(ir.Constant(number, value) for value in (0, 3, 1))])  # to read, keep, data
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), code
+
+
+@intrinsic
 def every(typing: Any, like: Any, number: Any) -> Any:
     """`number` in every lane; `like`: lanes or an array of the type wanted."""
     lanes = like if isinstance(like, Lanes) else _LANES[like.dtype]

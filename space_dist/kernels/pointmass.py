@@ -12,8 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from space_dist.kernels.build import ready
-from space_dist.kernels.lanes import entry
+from space_dist.kernels.lanes import BYTES, entry, prefetch
 from space_dist.kernels.scalars import clipped
+
+_AHEAD = 6  # slots whose numbers are on their way from memory
+_LINE = BYTES // 8  # numbers of float64 in a line of the cache
 
 
 class Physics(NamedTuple):
@@ -36,7 +39,13 @@ def advance(
     steps, 2) of unit variance, of which row `times` (n_slots,) is used, the last one behind the horizon.
     """
     step, limit, most = physics.step, physics.position_limit, physics.action_limit
-    for slot in range(position.shape[1]):
+    slots, size = position.shape[1], noise.shape[2] * noise.shape[3]
+    for slot in range(slots):
+        # Every slot's numbers lie an episode apart, where no CPU expects them: waiting took more time than computing.
+        ahead = min(slot + _AHEAD, slots - 1)
+        behind = (ahead * noise.shape[1] + min(times[ahead], noise.shape[1] - 1)) * size
+        for line in range(0, size, _LINE):
+            prefetch(noise, behind + line)
         time = min(times[slot], noise.shape[1] - 1)
         gate_x, half_width, decay = context[0, slot], context[1, slot] / 2, 1.0 - step * context[2, slot]
         force_x = physics.force * clipped(actions[slot, 0], most)

@@ -179,7 +179,7 @@ def collect(
     Raises SpaceDistError if an episode goes on beyond the environment's horizon, or goes another way when played again.
     """
     env, slots = stage.env, stage.env.n_slots // len(rollouts)
-    walking, table = Walking(rollouts, slots, length), EpisodeTable(rollouts, slots)
+    walking, table = Walking(rollouts, slots), EpisodeTable(rollouts, slots)
     acting = batched([rollout.policy for rollout in rollouts], slots)
     noise = _noise(env, rollouts, (length, slots))
     first_steps = np.concatenate([rollout.steps + np.arange(slots) for rollout in rollouts])

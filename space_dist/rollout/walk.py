@@ -42,6 +42,8 @@ class Unfinished:
 
     def same(self, other: Unfinished | None) -> bool:
         """Whether both are the same to the bit."""
+        if self is other:  # as whoever goes on at once is handed back what it gave
+            return True
         if other is None or (self.memory is None) != (other.memory is None):
             return False
         return all(
@@ -121,20 +123,26 @@ class Route(Protocol):
         """What runs in the slots; None: nothing."""
 
 
+_EPISODES = 4  # of a slot in a round, whose seeds are drawn before it is known how many there are
+
+
 class Walking:
     """Which instance, with which seed, each slot's next episode has, over several rollouts of `slots` slots each."""
 
-    def __init__(self, rollouts: Sequence[Route], slots: int, length: int) -> None:
-        self._slots = slots
+    def __init__(self, rollouts: Sequence[Route], slots: int) -> None:
+        self._rollouts, self._slots = rollouts, slots
         self.begun = np.zeros(len(rollouts), dtype=np.int64)  # episodes
         self._starts = np.array([rollout.start for rollout in rollouts])
         self._sizes = np.array([len(rollout.selection.ids) for rollout in rollouts])
         self._firsts = np.cumsum(self._sizes) - self._sizes  # of each rollout's instances among all
         self._ids = np.concatenate([rollout.selection.ids for rollout in rollouts])
         self._contexts = np.concatenate([rollout.selection.contexts for rollout in rollouts])
-        self._seeds = np.stack([
-            # One for each step: no round can begin more episodes than that.
-            episode_seeds(one.seed, Purpose.EPISODES, one.round, one.shard, count=slots * length) for one in rollouts
+        self._seeds = self._drawn(_EPISODES * slots)
+
+    def _drawn(self, count: int) -> NDArray[np.uint64]:
+        """`(len(rollouts), count)` seeds of their first episodes: fewer are the beginning of more."""
+        return np.stack([
+            episode_seeds(one.seed, Purpose.EPISODES, one.round, one.shard, count=count) for one in self._rollouts
         ])  # fmt: skip
 
     def next(self, slots: IntArray) -> tuple[IntArray, FloatArray, NDArray[np.uint64]]:
@@ -142,6 +150,9 @@ class Walking:
         owners = slots // self._slots
         numbers = self.begun[owners] + np.arange(len(slots)) - np.searchsorted(owners, owners)
         self.begun += np.bincount(owners, minlength=len(self.begun))
+        # One for each step, as many as there may be, would take a twelfth of a round.
+        while numbers.max(initial=0) >= self._seeds.shape[1]:
+            self._seeds = self._drawn(2 * self._seeds.shape[1])
         places = self._firsts[owners] + (self._starts[owners] + numbers) % self._sizes[owners]
         return self._ids[places], self._contexts[places], self._seeds[owners, numbers]
 

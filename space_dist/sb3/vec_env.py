@@ -127,7 +127,7 @@ class ContextVecEnv(VecEnv):
         env, slots = self._batched, self.num_envs
         self.plan, self._length, self._record, self.driven = plan, length, record, driven
         self._ended, self._left = False, plan.unfinished
-        self._walking = Walking([plan], slots, length + 1)  # what ends with the last step begins another
+        self._walking = Walking([plan], slots)
         self._table = EpisodeTable([plan], slots)
         self.time = 0
         self._observed: list[Observations] = []
