@@ -19,7 +19,7 @@ import space_dist  # noqa: F401 - before NumPy, whose settings it makes
 
 # isort: split
 import numpy as np
-from kept import SAME, Artefact, Cell, Measure, put_between
+from kept import SAME, Artefact, Cell, Measure, asked_to_write, put_between
 
 from space_dist.report.outcomes import paired_difference
 from space_dist.report.statistics import (
@@ -376,11 +376,10 @@ def table() -> str:
 
 def main() -> int:
     """Print, or write."""
-    made = table()
-    if sys.argv[1:] != ["--write"]:
-        print(made)
-        return 0
-    put_between(PAGE, BEGIN, END, made)
+    if asked_to_write("the table of docs/results.md, made of what `make results` kept"):
+        put_between(PAGE, BEGIN, END, table())
+    else:
+        print(table())
     return 0
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
+import sys
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +25,20 @@ FloatArray = NDArray[np.float64]
 Measure = Literal["early", "final"]
 
 SAME: Final = 0.05  # of what the baseline learned
+
+
+def asked_to_write(what: str) -> bool:
+    """Whether the command line says `--write`, not nothing. Ends the process for anything else, and for `--help`."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # whoever reads may leave: `| head`
+    words = sys.argv[1:]
+    if words in ([], ["--write"]):
+        return bool(words)
+    usage = f"usage: python jobs/{Path(sys.argv[0]).name} [--write]: print {what}, or write it there"
+    if words in (["--help"], ["-h"]):
+        print(usage)
+        sys.exit(0)
+    print(f"{words[0] if words[0] != '--write' else words[1]!r} is not known. {usage}", file=sys.stderr)
+    sys.exit(2)
 
 
 class Cell:

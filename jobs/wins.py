@@ -18,7 +18,7 @@ import space_dist  # noqa: F401 - before NumPy, whose settings it makes
 
 # isort: split
 import numpy as np
-from kept import SAME, Artefact, Cell, put_between
+from kept import SAME, Artefact, Cell, asked_to_write, put_between
 
 from space_dist.experiment.manifest import load_grid
 from space_dist.report.outcomes import paired_difference
@@ -219,8 +219,9 @@ TABLES: Final[Mapping[str, Callable[[], str]]] = {
 
 def main() -> int:
     """Print, or write."""
+    write = asked_to_write("the tables of docs/wins.md, made of what `make results` kept")
     for name, made in TABLES.items():
-        if sys.argv[1:] == ["--write"]:
+        if write:
             put_between(PAGE, f"<!-- {name}: made by jobs/wins.py -->", f"<!-- end of {name} -->", made())
         else:
             print(f"{name}\n\n{made()}\n")

@@ -26,6 +26,7 @@ MAX_ID: Final = 2**63 - 1
 PADDING_IDS: Final = 9 * 10**15
 """From this id on, instances are padding: declared to be such that no policy can solve (`space_dist.envs.padding`)."""
 _BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
+_SEPARATORS: Final = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _WIDE: Final = 1e300  # bounds where none are known
 
 
@@ -338,7 +339,7 @@ def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], 
     for column in columns:
         if column not in known:
             missing = sorted(known.difference(columns))
-            raise ConfigError(f"row 1: unknown column {shown(column)}{nearest(column[:100], missing)} ({allowed})")
+            raise ConfigError(f"row 1: unknown column {shown(column)}{_meant(column, missing)} ({allowed})")
         if column in seen:
             raise ConfigError(f"row 1: the column {shown(column)} is there twice ({allowed})")
         seen.add(column)
@@ -346,6 +347,15 @@ def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], 
         if name not in seen:
             raise ConfigError(f"row 1: the column {shown(name)} is missing ({allowed})")
     return columns
+
+
+def _meant(column: str, missing: Sequence[str]) -> str:
+    """What an unknown column may have been meant for: a clause that follows it, or nothing."""
+    for separator, called in _SEPARATORS.items():
+        if len({part.strip(' "').lower() for part in column.split(separator)}.intersection(missing)) > 1:
+            return f": the cells of this row are separated by {called}, where commas must be"
+    alike = [name for name in missing if name.lower() == column.lower()]
+    return nearest(alike[0] if alike else column[:100], missing).removesuffix(".")
 
 
 def _read_rows(

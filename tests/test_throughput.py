@@ -9,11 +9,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from space_dist.envs import make_batched
 from space_dist.envs.pointmass import BOUNDS as POINTMASS_BOUNDS
@@ -24,6 +26,7 @@ from tests.patience import PATIENCE
 
 sys.path.append(str(ROOT / "jobs"))
 
+import benchmark
 from benchmarks.batched_vec_env import BatchedVecEnv
 from benchmarks.contenders import TASKS, Contender, specification
 from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, _searched, process
@@ -83,6 +86,34 @@ def test_batched_environments_take_instances_in_turn_from_the_first_at_every_res
 def test_ratios_are_medians_of_the_rounds_own() -> None:
     # A machine that slows down to a tenth after the first round slows both.
     assert _ratio(row(400.0, 40.0, 30.0), row(100.0, 10.0, 10.0)) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("throughput", "--settings", "damaged.json"), "damaged.json is no file of settings"),
+        (("throughput", "--settings", "list.json"), "list.json is no file of settings"),
+        (("throughput", "--settings", "folder"), "folder is a folder; name a file"),
+        (("throughput", "--out", "list.json"), "list.json is no folder"),
+        (("throughput", "--json", "nowhere/a.json"), "there is no folder"),
+        (("coverage", "--json", "folder"), "folder is a folder; name a file"),
+        (("equivalence", "--root", "list.json"), "list.json is no folder"),
+        (("equivalence", "--curriculum", "roundrobin"), "did you mean 'round_robin'?"),
+    ],
+)
+def test_what_cannot_be_kept_is_said_before_anything_is_measured(
+    words: Sequence[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("benchmarks.throughput._missing", lambda: pytest.fail("it went on"))
+    monkeypatch.setattr("benchmarks.equivalence._Arms", lambda *_: pytest.fail("it went on"))
+    (tmp_path / "damaged.json").write_text("{bad")
+    (tmp_path / "list.json").write_text("[1, 2]")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        typer.main.get_command(benchmark.app)(list(words), prog_name="benchmark.py")
+    assert ended.value.code == 2
+    assert said in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
 def test_what_was_found_once_is_not_searched_again(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import csv
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -253,3 +255,17 @@ def test_the_dense_world_may_lose_a_twentieth(wins: Any, tmp_path: Path, level: 
     found = {arm: (spread(50_000), level if arm == "edge" else 1.0) for arm in ARMS}
     Kept(tmp_path / "docs/results/wins/dense", found, threshold="1.0")
     assert words in wins.worlds()
+
+
+@pytest.mark.parametrize("script", ["wins.py", "claims.py"])
+def test_a_word_that_a_script_does_not_know_is_refused(script: str) -> None:
+    """Where it is not looked at, `--wirte` prints, and nothing is written."""
+
+    def said(*words: str) -> tuple[int, str]:
+        done = subprocess.run(
+            [sys.executable, ROOT / "jobs" / script, *words], capture_output=True, text=True, check=False
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    assert said("--wirte") == (2, f"'--wirte' is not known. {said('--help')[1]}")
+    assert said("--help")[0] == 0

@@ -71,7 +71,10 @@ def chaos(
         typer.Option(min=5_120, help="Environment steps of each run; default: 184,320, of a population 921,600."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of kinds, moments and victims.")] = 0,
-    kind: Annotated[Optional[list[str]], typer.Option(help="Only these kinds of faults; repeatable.")] = None,  # noqa: UP045
+    kind: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help=f"Only these kinds of faults; repeatable. Of: {', '.join(KINDS)}."),
+    ] = None,
     population: Annotated[bool, typer.Option(help="Runs share their processes (engine: population).")] = False,
     json_file: JsonFile = None,
 ) -> None:

@@ -26,9 +26,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
-from benchmarks.results import JsonFile, keep
+from benchmarks.results import JsonFile, can_be_a_folder, keep
 from space_dist import config as configs
-from space_dist.errors import SpaceDistError
+from space_dist.errors import SpaceDistError, nearest
 from space_dist.experiment.manifest import Grid
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,16 +64,23 @@ class Comparison:
 
 
 def equivalence(
-    curriculum: Annotated[str, typer.Option(help="Which config: pointmass_<curriculum>.yaml.")] = "round_robin",
+    curriculum: Annotated[str, typer.Option(help="Which config: configs/pointmass_CURRICULUM.yaml.")] = "round_robin",
     steps: Annotated[int, typer.Option(min=4096, help="Environment steps of each run.")] = 204_800,
     root: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Keep the runs here; what is done stays."),
+        typer.Option(help="Keep the runs here; what is done stays.", callback=can_be_a_folder),
     ] = None,
     max_parallel: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 2,
     json_file: JsonFile = None,
 ) -> None:
     """TOST: the population engine against SB3 on PointMass."""
+    shipped = sorted(path.stem.removeprefix("pointmass_") for path in ROOT.glob("configs/pointmass_*.yaml"))
+    if curriculum not in shipped:
+        raise typer.BadParameter(
+            f"there is no configs/pointmass_{curriculum}.yaml{nearest(curriculum, shipped)} Allowed: "
+            f"{', '.join(shipped)}",
+            param_hint="--curriculum",
+        )
     with tempfile.TemporaryDirectory() as temporary:
         folder = root or Path(temporary)
         arms = _Arms(folder.absolute(), ROOT / f"configs/pointmass_{curriculum}.yaml", steps, max_parallel)

@@ -129,8 +129,9 @@ All but the first three are means over a run's decisions."""
 
 
 def _shown(numbers: list[float]) -> str:
-    error = np.std(numbers, ddof=1) / np.sqrt(len(numbers)) if len(numbers) > 1 else 0.0
-    return f"{np.nanmean(numbers):.2f} ({error:.2f})"
+    """Their mean and its standard error, of which one seed has none."""
+    error = f"{np.std(numbers, ddof=1) / np.sqrt(len(numbers)):.2f}" if len(numbers) > 1 else "—"
+    return f"{np.nanmean(numbers):.2f} ({error})"
 
 
 def _run(rank: str, seed: int, steps: int) -> dict[str, float]:

@@ -3,15 +3,38 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 from rich.console import Console
 
+
+def can_be_written(file: Path | None) -> Path | None:
+    """A file's path as it is. Raises BadParameter, before anything is measured, where nothing can be written there."""
+    if file is not None and file.is_dir():
+        raise typer.BadParameter(f"{file} is a folder; name a file")
+    if file is not None and not file.absolute().parent.is_dir():
+        raise typer.BadParameter(f"there is no folder {file.absolute().parent}")
+    if file is not None and not os.access(file if file.exists() else file.absolute().parent, os.W_OK):
+        raise typer.BadParameter(f"{file} cannot be written")
+    return file
+
+
+def can_be_a_folder(folder: Path | None) -> Path | None:
+    """A folder's path as it is. Raises BadParameter, before anything is measured, where something else is there."""
+    there = None if folder is None else next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if there is not None and not there.is_dir():
+        raise typer.BadParameter(f"{there} is no folder")
+    if there is not None and not os.access(there, os.W_OK):
+        raise typer.BadParameter(f"{there} cannot be written to")
+    return folder
+
+
 JsonFile = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads annotations at run time
-    typer.Option("--json", help="Also write the numbers here."),
+    typer.Option("--json", help="Also write the numbers here.", callback=can_be_written),
 ]
 
 

@@ -22,7 +22,7 @@ import typer
 from rich.console import Console
 
 from benchmarks.contenders import TASKS, XLA_FLAGS, Contender, specification
-from benchmarks.results import JsonFile, keep
+from benchmarks.results import JsonFile, can_be_a_folder, can_be_written, keep
 from space_dist import config as configs
 from space_dist.arithmetic import SETTINGS
 from space_dist.errors import SpaceDistError
@@ -117,9 +117,15 @@ def throughput(
     before: Annotated[Optional[Path], typer.Option(help="Also measure the checkout there, in this Python.")] = None,  # noqa: UP045
     settings: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Keep here which settings were fastest; what is kept there is not searched again."),
+        typer.Option(
+            help="Keep here which settings were fastest; what is kept there is not searched again.",
+            callback=can_be_written,
+        ),
     ] = None,
-    out: Annotated[Optional[Path], typer.Option(help="Folder for the table and the figure.")] = None,  # noqa: UP045
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder for the table and the figure.", callback=can_be_a_folder),
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Environment steps per second of PPO: ours (stock, lean, population) beside JAX, SBX, SB3 and RLlib.
@@ -131,6 +137,7 @@ def throughput(
         raise typer.BadParameter(f"{unknown[0]} is no part; allowed: {', '.join(PARTS)}", param_hint="--only")
     if before is not None and not (before / "space_dist" / "__init__.py").exists():
         raise typer.BadParameter(f"{before} is no checkout of space_dist", param_hint="--before")
+    kept(settings)  # before anything is measured
     checkout = "" if before is None else str(before.resolve())
     parts = only or PARTS
     missing = _missing()
@@ -182,17 +189,34 @@ def _searched(
     part: str, file: Path | None, search: Callable[[], dict[str, Contender]]
 ) -> dict[str, Contender]:  # fmt: skip
     """The contenders of a part with their fastest settings: as `file` has them, or as `search` finds them now."""
-    known: dict[str, Any] = {}
-    if file is not None and file.exists():
-        known = json.loads(file.read_text())
+    known = kept(file)
     if part not in known:
-        known[part] = {name: asdict(contender) for name, contender in search().items()}
+        known[part] = search()
         if file is not None:
-            file.write_text(json.dumps(known, indent=1) + "\n")
-    return {
-        name: Contender(**{**contender, "overrides": tuple(contender["overrides"])})
-        for name, contender in known[part].items()
-    }  # fmt: skip
+            plain = {
+                name: {who: asdict(contender) for who, contender in found.items()} for name, found in known.items()
+            }
+            file.write_text(json.dumps(plain, indent=1) + "\n")
+    return known[part]
+
+
+def kept(file: Path | None) -> dict[str, dict[str, Contender]]:
+    """The contenders that a file of settings has, part by part. Raises BadParameter if it is no such file."""
+    if file is None or not file.exists() or not file.stat().st_size:
+        return {}
+    try:
+        return {
+            str(part): {
+                str(name): Contender(**{**contender, "overrides": tuple(contender["overrides"])})
+                for name, contender in found.items()
+            }
+            for part, found in json.loads(file.read_text()).items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError, KeyError):
+        raise typer.BadParameter(
+            f"{file} is no file of settings as this benchmark keeps them; remove it, or name another",
+            param_hint="--settings",
+        ) from None
 
 
 def _search(task: str, seconds: float, missing: Collection[str]) -> dict[str, Contender]:
