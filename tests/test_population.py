@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from space_dist.ledger import CURRICULUM, Ledger
 from space_dist.rollout import Shard, Worker, collecting
 from space_dist.rollout.policy import policies_of
 from space_dist.rollout.walk import Walk
+from space_dist.run import population
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import Outcome, launch, policy_of
 from space_dist.run.population import advance, member
@@ -88,6 +90,28 @@ def test_a_member_is_what_its_run_is_alone(kind: str, env_id: str, normalised: b
             assert results(folder) == expected[number]
             assert Ledger(folder).status().state == "done"
     assert len({content["metrics.jsonl"] for content in expected}) == 4
+
+
+def test_a_part_of_an_evaluation_meets_the_environments_that_it_met_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which have drawn for its episodes already, as those of other parts have not."""
+    met: dict[bytes, list[Any]] = defaultdict(list)  # environments, by the seeds of the episodes that they played
+    evaluated = population.evaluate
+
+    def watched(env: Any, trials: Any) -> Any:
+        met[np.concatenate([trial.seeds for trial in trials]).tobytes()].append(env)
+        return evaluated(env, trials)
+
+    monkeypatch.setattr(population, "evaluate", watched)
+    monkeypatch.setattr(population, "_SLOTS", 4)
+    configs = [configured(tmp_path / str(number), 0, evaluation={"every_steps": N_STEPS}) for number in range(2)]
+    configs = [config.model_copy(update={"seed": number}) for number, config in enumerate(configs)]
+    together(configs, [tmp_path / f"run{number}" for number in range(2)])
+    assert len(met) == 4  # two parts of each of two batches
+    assert {len(envs) for envs in met.values()} != {1}
+    assert all(env is envs[0] for envs in met.values() for env in envs)
+    assert len({id(envs[0]) for envs in met.values()}) == len(met)
 
 
 DRAWING = (

@@ -37,7 +37,8 @@ _ROLLOUT_COPIES, _WAITING_COPIES = 10, 4
 _PER_STEP = 8  # numbers beside observation and action: reward, value, advantage, ...
 _TRPO_KEPT, _PPO_KEPT = 5, 6  # times the units of all layers
 _PARAMETER_COPIES = 10
-_OBJECTS_BYTES = 3 << 20  # the run, its curriculum, its ledger, and its part of environments that are kept
+# Python's own (the run, its curriculum, its ledger), and the environments in which it is evaluated.
+_OBJECTS_BYTES = 3 << 20
 _NUMBER_BYTES = 4
 
 Array = NDArray[np.float32]
