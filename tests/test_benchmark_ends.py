@@ -82,3 +82,29 @@ finally:
     process.send_signal(signal.SIGTERM)
     assert process.communicate("\n", timeout=PATIENCE)[0] == "cleared\n"
     assert process.returncode == 128 + signal.SIGTERM
+
+
+def test_what_a_benchmark_waits_for_ends_with_it() -> None:
+    """Its child, which does not hear SIGTERM, and that one's child in a session of its own."""
+    child = (
+        "import os, signal, subprocess, sys, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+        f"subprocess.Popen({SLEEPS!r}, start_new_session=True); print('ready', flush=True); time.sleep(1000)"
+    )
+    script = f"""
+import signal, sys
+sys.path.insert(0, "jobs")
+from benchmarks import processes
+processes._END_SECONDS = 0.2
+signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(143))
+processes.completed([sys.executable, "-c", {child!r}])
+"""
+    mark = f"test-{os.getpid()}-waits"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, MARK: mark}
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    assert len(marked(mark)) == 3
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(PATIENCE) == 143
+    assert marked(mark) == []

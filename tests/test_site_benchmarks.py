@@ -110,7 +110,7 @@ def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pyte
 @executes(("performance.md", 4))
 def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Two trials of two seeds and an update each; Optuna's study with all seeds in processes of its own."""
-    ran, studies = subprocess.run, []
+    ran, studies = tune.completed, []
 
     def run(words: list[str], **how: Any) -> Any:
         if words[1:4] == ["-P", "-m", "space_dist.cli"]:
@@ -127,7 +127,7 @@ def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
             found = optuna_study.studied(optuna_study.Asked(**given), pool)
         return subprocess.CompletedProcess(words, 0, json.dumps(found))
 
-    monkeypatch.setattr(tune.subprocess, "run", run)
+    monkeypatch.setattr(tune, "completed", run)
     monkeypatch.setattr(tune, "cores", lambda: 1)
     monkeypatch.setattr(throughput, "process", lambda *_: {"kernel": 1e-6})
     sizes = {"trials": 2, "seeds": 2, "generation": 1, "steps": 2048, "rounds": 1, "n-envs": 64}

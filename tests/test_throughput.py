@@ -29,6 +29,7 @@ sys.path.append(str(ROOT / "jobs"))
 import benchmark
 from benchmarks.batched_vec_env import BatchedVecEnv
 from benchmarks.contenders import TASKS, Contender, specification
+from benchmarks.pic import _shown
 from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, _searched, process
 
 LINE = "tests.tiny_env:make"
@@ -114,6 +115,10 @@ def test_what_cannot_be_kept_is_said_before_anything_is_measured(
         typer.main.get_command(benchmark.app)(list(words), prog_name="benchmark.py")
     assert ended.value.code == 2
     assert said in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def test_one_seed_has_no_standard_error() -> None:
+    assert (_shown([2.0]), _shown([1.0, 3.0])) == ("2.00 (—)", "2.00 (1.00)")
 
 
 def test_what_was_found_once_is_not_searched_again(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
+from benchmarks.processes import completed
 from benchmarks.results import JsonFile, can_be_a_folder, keep
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError, nearest
@@ -159,7 +160,7 @@ class _Arms:
         }))  # fmt: skip
         command = [sys.executable, "-m", "space_dist.cli", "grid", "run", str(path), "--root", str(self.folder),
                    "--max-parallel", str(self.max_parallel)]  # fmt: skip
-        if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
+        if completed(command, stdout=subprocess.DEVNULL).returncode:
             raise SpaceDistError(f"the arm {name} did not complete: {self.folder / name}")
         grid = Grid(self.folder / name)
         rows = [grid.ledger(run).rows() for run in grid.manifest().runs()]

@@ -93,7 +93,13 @@ def pic(
     """What SPaCE's ranking measures on PointMass: values against true returns, and what each ranking comes to."""
     asked = [(rank, seed, steps) for seed in range(seeds) for rank in RANKS]
     with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
-        found = list(pool.map(_run, *zip(*asked, strict=True)))
+        running = [pool.submit(_run, *one) for one in asked]
+        try:
+            found = [one.result() for one in running]
+        except (SystemExit, KeyboardInterrupt):  # or the pool would have its runs end first, which takes minutes
+            for worker in multiprocessing.active_children():
+                worker.kill()
+            raise
     rows: list[dict[str, Any]] = []
     for rank in RANKS:
         mine = [one for (which, _, _), one in zip(asked, found, strict=True) if which == rank]

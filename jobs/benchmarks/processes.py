@@ -3,10 +3,34 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+from collections.abc import Sequence
+from typing import Any
 
 import psutil
 
 MARK = "SPACE_DIST_CHAOS"  # in the environment of every process that belongs to one rehearsal
+
+_END_SECONDS = 5.0  # for what is asked to end
+
+
+def completed(words: Sequence[str], **how: Any) -> subprocess.CompletedProcess[str]:
+    """As `subprocess.run`, with output as text; where we are to end meanwhile, all that it has started ends, too."""
+    running = subprocess.Popen(words, text=True, **how)
+    try:
+        output, errors = running.communicate()
+    finally:
+        if running.poll() is None:
+            top = psutil.Process(running.pid)
+            everybody = [top, *top.children(recursive=True)]
+            top.terminate()  # a grid has its runs end
+            psutil.wait_procs(everybody, timeout=_END_SECONDS)
+            everybody += [one for parent in everybody if is_live(parent) for one in parent.children(recursive=True)]
+            for process in everybody:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    process.kill()
+            running.wait()
+    return subprocess.CompletedProcess(words, running.returncode, output, errors)
 
 
 def is_named(process: psutil.Process, word: str) -> bool:

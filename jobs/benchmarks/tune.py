@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -12,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from subprocess import PIPE
 from typing import Annotated, Any, Optional
 
 import typer
@@ -20,6 +20,7 @@ from rich.console import Console
 from benchmarks import throughput
 from benchmarks.contenders import Contender, specification
 from benchmarks.optuna_study import Asked
+from benchmarks.processes import completed
 from benchmarks.results import JsonFile, keep
 from space_dist import config as configs
 from space_dist.arithmetic import CHOICE
@@ -134,7 +135,7 @@ def _ours(folder: Path, search: Mapping[str, Any], kernel: float = 0.0) -> Taken
     file.write_text(configs.to_yaml(dict(search)))
     words = [sys.executable, "-P", "-m", "space_dist.cli", "tune", "run", str(file), "--root", str(folder / "runs")]
     start = time.perf_counter()
-    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=folder, env=_environment())
+    done = completed(words, stdout=PIPE, stderr=PIPE, cwd=folder, env=_environment())
     seconds = time.perf_counter() - start
     if done.returncode:
         raise SpaceDistError(f"the search did not complete: {done.stdout[-2000:]}{done.stderr[-2000:]}")
@@ -192,7 +193,7 @@ def _optuna(folder: Path, seeds: int, n_envs: int) -> Taken:
     code = "from benchmarks.optuna_study import main; main()"
     words = [sys.executable, "-P", "-W", "ignore", "-c", code, json.dumps(asdict(asked))]
     start = time.perf_counter()
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    done = completed(words, stdout=PIPE, stderr=PIPE, env=environment)
     seconds = time.perf_counter() - start
     if done.returncode:
         raise SpaceDistError(f"the study did not complete: {done.stdout[-2000:]}{done.stderr[-2000:]}")
