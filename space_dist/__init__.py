@@ -15,7 +15,14 @@ from space_dist import arithmetic
 
 arithmetic.settle()  # before any library is loaded that chooses its kernels by the CPU
 
-from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError, SpaceDistError  # noqa: E402
+from space_dist.errors import (  # noqa: E402
+    ConfigError,
+    Interrupted,
+    LedgerError,
+    NotPlannedError,
+    RunLockedError,
+    SpaceDistError,
+)
 
 if TYPE_CHECKING:
     from space_dist.api.grids import GridRun, run_grid
@@ -38,6 +45,7 @@ __all__ = [
     "InstanceSet",
     "Interrupted",
     "LedgerError",
+    "NotPlannedError",
     "ReportView",
     "Run",
     "RunConfig",
