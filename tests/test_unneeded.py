@@ -38,6 +38,13 @@ SHAPES = """
 torch.compiler.is_compiling(), torch.export.Dim
 print(tuple(torch.nn.Conv2d(3, 4, 3, device="meta")(torch.empty(1, 3, 8, 8, device="meta")).shape))
 """
+REACHES = """
+print(tuple(torch.broadcast_shapes((3, 1), (2,))))
+normal = torch.distributions.MultivariateNormal(torch.zeros(2), torch.eye(2))
+print(tuple(normal.expand((3,)).rsample().shape), torch._refs.__file__ is not None)
+print(len(torch._decomp.decomposition_table) > 100, torch._custom_ops.__file__ is not None)
+import torch._refs
+"""
 LOGS = """
 import tempfile
 from pathlib import Path
@@ -79,6 +86,10 @@ def test_an_optimiser_imports_no_compiler_and_who_compiles_has_it() -> None:
 def test_who_exports_or_logs_has_what_it_takes() -> None:
     assert said(TRAINS + EXPORTS + SHAPES)[1:] == ["batch ExportedProgram", "(1, 4, 6, 6)"]
     assert said(TRAINS + LOGS)[1:] == ["[True] torch.utils.tensorboard.writer"]
+
+
+def test_what_torch_reaches_without_importing_it_is_there() -> None:
+    assert said(TRAINS + REACHES)[1:] == ["(3, 2)", "(3, 2) True", "True True"]
 
 
 def test_a_script_that_imports_torch_has_all_of_it() -> None:

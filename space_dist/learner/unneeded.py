@@ -27,6 +27,8 @@ TRACERS: Final = ("torch._meta_registrations", "torch.export")
 _LOGS: Final = "torch.utils.tensorboard"
 _SEEN_TO_WORK_WITHOUT_TRACERS: Final = "2.13."  # versions of torch; others import all of themselves
 _GENERATORS: Final = "torch._prims.rng_prims"  # torch.Generator wants it, which the tracers import otherwise
+# What parts of torch reach as an attribute, `torch._refs`, without importing it.
+_REACHED: Final = ("torch._custom_op.impl", "torch._custom_ops", "torch._decomp", "torch._refs")
 
 
 class _StandIn(ModuleType):
@@ -73,6 +75,9 @@ def _stand_in() -> None:
         for name in TRACERS:
             sys.modules.setdefault(name, _StandIn(name))
         importlib.import_module(_GENERATORS)
+        for name in _REACHED:  # only as attributes: an import of one is an import
+            package, _, attribute = name.rpartition(".")
+            setattr(sys.modules[package], attribute, _StandIn(name))
     sys.modules.setdefault(COMPILER, _Compiler(COMPILER))
     summary = f"{_LOGS}.summary"
     if not {_LOGS, "stable_baselines3"} & set(sys.modules) and importlib.util.find_spec("tensorboard"):
