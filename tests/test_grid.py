@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist.cli.grids import grid_retry
 from space_dist.cli.overview import print_failures
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause, Ended
@@ -350,13 +351,23 @@ def test_torn_and_foreign_rows_are_passed_over(one: tuple[Grid, Manifest, Run]) 
     assert attempts.history().begun == 1
 
 
-def test_a_damaged_status_is_a_failure_that_says_so(one: tuple[Grid, Manifest, Run]) -> None:
+def test_a_damaged_status_is_a_failure_that_says_so(
+    one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """To forgive would change nothing: what to do is told instead."""
     grid, manifest, run = one
     ledger = grid.ledger(run)
     ledger.folder.mkdir(parents=True)
     ledger.status_file.write_text("{}")
     found = run_status_of(run, ledger, manifest.retry, CODE)
-    assert (found.condition, "damaged" in found.detail) == ("failed", True)
+    assert (found.condition, found.cause, "damaged" in found.detail) == ("failed", Cause.DAMAGED, True)
+    grid_retry(grid.folder, ["damaged"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"remove {ledger.status_file}" in said
+    assert said.endswith("0 runs may be tried again")
+    assert not Attempts(ledger).path.exists()
+    ledger.status_file.unlink()
+    assert run_status_of(run, ledger, manifest.retry, CODE).condition == "waiting"
 
 
 def test_last_lines_of_anything(tmp_path: Path) -> None:

@@ -454,7 +454,7 @@ def test_a_run_that_cannot_be_read_is_a_failed_one(tmp_path: Path) -> None:
     finish(grid, 1, 1, 2.0)
     report = build_grid_report(grid)
     assert report.table[1]["seeds"] == "1/2"
-    assert "| k=2, seed 0 | crash |" in report.markdown
+    assert "| k=2, seed 0 | damaged |" in report.markdown
     assert "metrics.jsonl" in report.markdown
 
 

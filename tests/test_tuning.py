@@ -363,6 +363,18 @@ def test_an_end_that_says_nothing_of_the_setting_holds_the_search_up(cause: Caus
     assert choices(alone)[:4] == choices(after)
 
 
+def test_a_damaged_run_says_nothing_of_its_setting(tmp_path: Path) -> None:
+    made = plan_search(write_tune(tmp_path), tmp_path / "runs")
+    first, *others = open_runs(made.manifest)
+    for run in others:
+        end(made.grid, run, reached(run))
+    ledger = made.grid.ledger(first)
+    ledger.folder.mkdir(parents=True, exist_ok=True)
+    ledger.status_file.write_text("{}")
+    with pytest.raises(HeldUpError, match=f"damaged, which says nothing of its setting.*{ledger.status_file}"):
+        advance(made.grid, made.manifest)
+
+
 def test_what_was_told_stays_though_a_run_is_tried_again(tmp_path: Path) -> None:
     grid, manifest = search_through(
         write_tune(tmp_path), tmp_path / "runs", generations=1,

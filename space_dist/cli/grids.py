@@ -321,11 +321,15 @@ def grid_retry(
     place, manifest = _found(grid, root)
     chosen = [run_status for run_status in run_statuses_of(place, manifest)
               if run_status.condition == "failed" and run_status.cause in causes]  # fmt: skip
-    for run_status in chosen:
+    damaged = [run_status for run_status in chosen if run_status.cause is Cause.DAMAGED]
+    for run_status in damaged:
+        say(f"{run_status.run.title}: {run_status.detail}; {run_status.way_out}")
+    forgiven = [run_status for run_status in chosen if run_status not in damaged]
+    for run_status in forgiven:
         Attempts(run_status.ledger).forgive()
         say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
-    follow_up = "" if not chosen else f"; `space-dist grid run {place.folder}` or `grid submit` does it"
-    say(f"{len(chosen)} runs may be tried again{follow_up}")
+    follow_up = "" if not forgiven else f"; `space-dist grid run {place.folder}` or `grid submit` does it"
+    say(f"{len(forgiven)} runs may be tried again{follow_up}")
 
 
 @grid_app.command("work", hidden=True)

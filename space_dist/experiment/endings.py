@@ -28,6 +28,7 @@ class Cause(StrEnum):
     NODE_LOST = "node_lost"
     TIMEOUT = "timeout"
     CRASH = "crash"
+    DAMAGED = "damaged"  # a file of its folder, by whatever hand: no attempt of it can mend that
     KILLED = "killed"
     STOPPED = "stopped"  # on the user's own request; not a failure
 
@@ -44,6 +45,7 @@ _WORDS = {
     Cause.NODE_LOST: "node lost",
     Cause.TIMEOUT: "timeout",
     Cause.CRASH: "crash",
+    Cause.DAMAGED: "damaged",
     Cause.KILLED: "killed by an unknown hand",
     Cause.STOPPED: "stopped",
 }
@@ -150,7 +152,7 @@ def why_ended(seen: Evidence) -> Ended:
     if seen.held or seen.job_succeeded:
         return Busy(None, _ELSEWHERE)
     if seen.damage:
-        return Ended(Cause.CRASH, seen.damage)
+        return Ended(Cause.DAMAGED, seen.damage)
     if code is None:
         return _not_seen_to_end(seen)
     knows = said is not None and code != Interrupted.exit_code

@@ -170,6 +170,14 @@ class RunStatus:
     supervised: bool = False
 
     @property
+    def way_out(self) -> str:
+        """What lets a failed run be tried again."""
+        if self.cause is Cause.DAMAGED:
+            return f"restore the file; or remove {self.ledger.status_file}, and it goes on from its newest checkpoint"
+        grid = self.ledger.folder.parent.parent
+        return f"`space-dist grid retry {grid} --cause {self.cause}` lets it be tried again"
+
+    @property
     def in_words(self) -> str:
         """`failed: out of memory`, `waiting (preempted)`, ..."""
         if self.cause is None or self.condition in ("done", "running"):
@@ -244,7 +252,7 @@ def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:
     """Whether a run that ended so may be tried again. `ends` counts the ends by cause, this one included if known."""
     if cause is Cause.STOPPED:
         return True
-    allowed = {**retry.model_dump(), Cause.CONFIG_ERROR: 0}
+    allowed = {**retry.model_dump(), Cause.CONFIG_ERROR: 0, Cause.DAMAGED: 0}
     return ends.get(cause, 0) <= int(allowed[cause])
 
 

@@ -138,7 +138,7 @@ def advance(grid: Grid, manifest: Manifest) -> Manifest | None:
     found = run_statuses(grid, manifest, manifest.code, open_runs(manifest))
     if any(one.condition in ("running", "waiting") for one in found):
         return None
-    _refuse_held_up(grid, found)
+    _refuse_held_up(found)
     if search.open:
         manifest = _judged(grid, manifest, search, found)
     else:
@@ -148,12 +148,12 @@ def advance(grid: Grid, manifest: Manifest) -> Manifest | None:
     return manifest
 
 
-def _refuse_held_up(grid: Grid, found: Sequence[RunStatus]) -> None:
+def _refuse_held_up(found: Sequence[RunStatus]) -> None:
     for one in found:
         if one.condition == "failed" and one.cause is not None and one.cause not in OF_THE_SETTING:
             raise HeldUpError(
                 f"{one.run.title}: {one.in_words}, which says nothing of its setting, so the search does not go on "
-                f"without it; `space-dist grid retry {grid.folder} --cause {one.cause}` lets it be tried again"
+                f"without it; {one.way_out}"
             )
 
 

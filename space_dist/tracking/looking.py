@@ -16,7 +16,8 @@ from space_dist.experiment.status import Attempts, History, RunStatus, run_statu
 from space_dist.ledger import METRICS, Ledger, Row, Status, decode_row
 from space_dist.system.provenance import code_digest
 
-_OWN_FAULTS: Final = (Cause.CONFIG_ERROR, Cause.OUT_OF_MEMORY, Cause.CRASH)  # the others were ended from outside
+# The others were ended from outside.
+_OWN_FAULTS: Final = (Cause.CONFIG_ERROR, Cause.OUT_OF_MEMORY, Cause.CRASH, Cause.DAMAGED)
 _TAIL_BYTES: Final = 64 << 10
 
 Signature = tuple[Any, ...]
