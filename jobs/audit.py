@@ -296,6 +296,9 @@ def expect(run: Run, iteration: int, which: str, chosen: NDArray[np.int64]) -> N
 
 def main(arguments: list[str]) -> int:
     """The exit code."""
+    if arguments in (["--help"], ["-h"]):
+        print(__doc__)
+        return 0
     if len(arguments) != 1 or arguments[0].startswith("-"):
         print("usage: python jobs/audit.py RUN, RUN being the folder of one run, runs/NAME/s0 for one", file=sys.stderr)
         return 2

@@ -122,6 +122,8 @@ def test_the_audit_is_a_program_that_knows_nothing_of_our_code(run_of: Any) -> N
     command = [sys.executable, "-c", code, str(run_of("abs"))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "[]"), done.stderr
+    shown = subprocess.run([sys.executable, str(AUDIT), "--help"], capture_output=True, text=True, timeout=300)
+    assert (shown.returncode, "Exit code 0" in shown.stdout) == (0, True)
 
 
 def test_values_scored_again_under_new_scales_are_what_the_decision_saw(run_of: Any) -> None:
