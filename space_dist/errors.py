@@ -23,6 +23,10 @@ class LedgerError(SpaceDistError):
     """A run's folder is damaged, incomplete, or belongs to another configuration."""
 
 
+class UnreadableError(LedgerError):
+    """A run cannot go on, for none of its checkpoints is as it was written."""
+
+
 class NotPlannedError(LedgerError):
     """The grid or search that a user names was never begun below that root: another command, or root, is meant."""
 

@@ -84,7 +84,8 @@ finally:
     assert process.returncode == 128 + signal.SIGTERM
 
 
-def test_what_a_benchmark_waits_for_ends_with_it() -> None:
+@pytest.mark.parametrize("told", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
+def test_what_a_benchmark_waits_for_ends_with_it(told: signal.Signals) -> None:
     """Its child, which does not hear SIGTERM, and that one's child in a session of its own."""
     child = (
         "import os, signal, subprocess, sys, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
@@ -96,15 +97,17 @@ sys.path.insert(0, "jobs")
 from benchmarks import processes
 processes._END_SECONDS = 0.2
 signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(143))
+signal.signal(signal.SIGINT, lambda number, frame: sys.exit(143))
 processes.completed([sys.executable, "-c", {child!r}])
 """
     mark = f"test-{os.getpid()}-waits"
     process = subprocess.Popen(
-        [sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, MARK: mark}
-    )
+        [sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, MARK: mark},
+        start_new_session=True,
+    )  # fmt: skip
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     assert len(marked(mark)) == 3
-    process.send_signal(signal.SIGTERM)
+    os.killpg(process.pid, told)  # as a terminal does it
     assert process.wait(PATIENCE) == 143
     assert marked(mark) == []

@@ -157,6 +157,18 @@ def test_cell_ids_change_with_what_decides_results(change: dict[str, Any], tmp_p
     assert (before == after) == (change == {"env.kwargs": {}})  # which is the default
 
 
+def test_a_column_that_one_cell_reads_is_no_other_cells(tmp_path: Path) -> None:
+    """The same file, of which only the first has a column beside the features."""
+    instances = write_line_instances(tmp_path)
+    train = Path(instances["instances.train"])
+    head, *lines = train.read_text().splitlines()
+    train.write_text("\n".join([f"{head},effort", *(f"{line},1" for line in lines)]) + "\n")
+    curricula = [{"kind": "manual", "column": "effort"}, {"kind": "space"}]
+    path = write_grid(tmp_path, set={**TINY, **instances}, grid={"curriculum": curricula})
+    with pytest.raises(ConfigError, match="effort"):
+        plan(path, tmp_path / "runs")
+
+
 def test_cell_ids_change_with_an_edited_instance_file(tmp_path: Path) -> None:
     copy = tmp_path / "train.csv"
     text = (ROOT / "configs/instances/pointmass_uniform_train.csv").read_text()
@@ -360,10 +372,10 @@ def test_a_damaged_status_is_a_failure_that_says_so(
     ledger.folder.mkdir(parents=True)
     ledger.status_file.write_text("{}")
     found = run_status_of(run, ledger, manifest.retry, CODE)
-    assert (found.condition, found.cause, "damaged" in found.detail) == ("failed", Cause.DAMAGED, True)
-    grid_retry(grid.folder, ["damaged"])
+    assert (found.condition, found.cause, "damaged" in found.detail) == ("failed", Cause.UNREADABLE, True)
+    grid_retry(grid.folder, ["unreadable"])
     said = " ".join(capsys.readouterr().out.split())
-    assert f"remove {ledger.status_file}" in said
+    assert f"remove {ledger.folder}, and it begins anew" in said
     assert said.endswith("0 runs may be tried again")
     assert not Attempts(ledger).path.exists()
     ledger.status_file.unlink()

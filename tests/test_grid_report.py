@@ -301,7 +301,7 @@ def test_a_run_that_cannot_be_read_is_a_failed_one(tmp_path: Path) -> None:
     finish(grid, 1, 1, 2.0)
     report = build_grid_report(grid)
     assert report.table[1]["seeds"] == "1/2"
-    assert "| k=2, seed 0 | damaged |" in report.markdown
+    assert "| k=2, seed 0 | unreadable |" in report.markdown
     assert "metrics.jsonl" in report.markdown
 
 
@@ -327,6 +327,22 @@ def test_a_run_on_foreign_instances_is_in_no_number_and_named(tmp_path: Path) ->
     assert "2 runs failed and are in no number: 2 not comparable." in report.markdown
     assert "| k=2, seed 0 | not comparable |" in report.markdown
     assert [row["last_test_return"] for row in rows(report.folder / "runs.csv")][3:] == ["", "", "3.0"]
+
+
+def test_whether_a_run_is_foreign_needs_no_other_run(tmp_path: Path) -> None:
+    """The manifest knows the instances: the only run that is done need not be right."""
+    grid = make_grid(tmp_path / "g", [{"k": 1}], n_seeds=2)
+    own = finish(grid, 0, 0, 1.0)
+    digest = hashlib.sha256(own.read(own.instances("train"))).hexdigest()
+    tested = hashlib.sha256(own.read(own.instances("test"))).hexdigest()
+    for instances, seeds in (
+        ({"a.csv": digest, "b.csv": tested}, "1/2"),
+        ({"a.csv": "0" * 64, "b.csv": tested}, "0/2"),
+    ):
+        grid.freeze(dataclasses.replace(grid.manifest(), instances=instances), {})
+        report = build_grid_report(grid)
+        assert report.table[0]["seeds"] == seeds
+    assert "the instances that it was trained on are not those of the grid (a.csv)" in report.markdown
 
 
 def test_returns_of_different_environments_are_never_mixed(tmp_path: Path) -> None:

@@ -455,6 +455,8 @@ def test_the_command_takes_a_grid_by_each_of_its_names(uri: str, tmp_path: Path)
         assert done.exit_code == 0, done.output
         answers.append(done.output)
     assert "1 new, 3 rows pushed" in answers[0]
+    by_name = CliRunner().invoke(app, ["sync", "--uri", uri, "demo", "--root", str(tmp_path / "runs")])
+    answers.append(by_name.output)
     assert all("1 runs are up to date in MLflow (0 new, 0 rows pushed" in answer for answer in answers[1:])
     assert "1 have no tracking.uri" in CliRunner().invoke(app, ["sync", "--follow", str(grid.folder)]).output
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+import io
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -244,6 +247,44 @@ def test_it_goes_on_from_whatever_takes_the_place_of_its_tensors() -> None:
     for name, array in theirs.items():
         np.testing.assert_array_equal(ours[name], array, err_msg=name)
         assert not np.array_equal(saved[name], array), name
+
+
+def saved_and_loaded(model: Any) -> Any:
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    loaded = type(model).load(file)
+    loaded.rollout_buffer = copy.deepcopy(model.rollout_buffer)
+    return loaded
+
+
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "itself": lambda model: model,
+    "deepcopy": copy.deepcopy,
+    "pickled": lambda model: cloudpickle.loads(cloudpickle.dumps(model)),
+    "saved": saved_and_loaded,
+    "shared": lambda model: model.policy.share_memory() and model,
+}
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_a_copy_learns_as_the_original_does(name: str) -> None:
+    """Whose numbers it must not touch."""
+    learner = learner_for(small(update="lean"), LINE)
+    learner.update(shards_of(learner, LINE), round=0, steps=96)
+    model = learner.model
+    other = COPIES[name](model)
+    before = torch.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
+    other.set_logger(model.logger)
+    weights = []
+    for one in (other, model) if other is not model else (other,):
+        torch.testing.assert_close(torch.nn.utils.parameters_to_vector(one.policy.parameters()), before)
+        np.random.seed(5)  # noqa: NPY002 - as SB3 draws
+        one.rollout_buffer.generator_ready = False
+        one.train()
+        weights.append(torch.nn.utils.parameters_to_vector(one.policy.parameters()).detach())
+    assert not torch.equal(weights[0], before)
+    assert torch.equal(weights[0], weights[-1])
 
 
 @pytest.mark.parametrize("env_id", [LINE, DISCRETE_LINE], ids=["gaussian", "categorical"])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
+from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.learner import CoupledLearner
 from space_dist.ledger import CURRICULUM, Ledger
@@ -105,6 +106,7 @@ def test_a_part_of_an_evaluation_meets_the_environments_that_it_met_before(
 
     monkeypatch.setattr(population, "evaluate", watched)
     monkeypatch.setattr(population, "_SLOTS", 4)
+    monkeypatch.delattr(BatchedSingles, "close")  # nor are they as costly as others' environments may be
     configs = [configured(tmp_path / str(number), 0, evaluation={"every_steps": N_STEPS}) for number in range(2)]
     configs = [config.model_copy(update={"seed": number}) for number, config in enumerate(configs)]
     together(configs, [tmp_path / f"run{number}" for number in range(2)])
@@ -112,6 +114,32 @@ def test_a_part_of_an_evaluation_meets_the_environments_that_it_met_before(
     assert {len(envs) for envs in met.values()} != {1}
     assert all(env is envs[0] for envs in met.values() for env in envs)
     assert len({id(envs[0]) for envs in met.values()}) == len(met)
+
+
+@pytest.mark.parametrize(("slots", "costly"), [(2, False), (4, True)])
+def test_where_parts_are_many_or_costly_one_environment_of_a_size_is_kept(
+    slots: int, costly: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seven parts over two batches, say: those of four would be dropped, each just before it is wanted."""
+    used: list[Any] = []
+    evaluated = population.evaluate
+
+    def watched(env: Any, trials: Any) -> Any:
+        used.append(env)
+        return evaluated(env, trials)
+
+    monkeypatch.setattr(population, "evaluate", watched)
+    monkeypatch.setattr(population, "_SLOTS", slots)
+    if not costly:
+        monkeypatch.delattr(BatchedSingles, "close")
+    configs = [configured(tmp_path / str(number), 0, evaluation={"every_steps": N_STEPS}) for number in range(2)]
+    configs = [config.model_copy(update={"seed": number}) for number, config in enumerate(configs)]
+    together(configs, [tmp_path / f"run{number}" for number in range(2)])
+    made = {id(env) for env in used}
+    assert len(made) <= 4  # sizes of parts, of two batches
+    first = used[: len(used) // 3]
+    assert {id(env) for env in first} == made
+    assert len(used) > 3 * len(made)
 
 
 DRAWING = (

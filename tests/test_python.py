@@ -252,6 +252,9 @@ def test_a_grids_folder_is_no_run_and_says_what_reads_it(tmp_path: Path) -> None
     folder = plan_search(write_tune(tmp_path, name="sought"), tmp_path / "runs").grid.folder
     with pytest.raises(LedgerError, match=r"a search's: `space-dist tune report "):
         space_dist.Run(folder)
+    (tmp_path / "manifest.json").write_text("{}")  # somebody else's
+    with pytest.raises(LedgerError, match="holds no run"):
+        space_dist.Run(tmp_path)
 
 
 def test_a_run_with_a_dashboard_ends_with_where_to_look(

@@ -363,7 +363,7 @@ def test_an_end_that_says_nothing_of_the_setting_holds_the_search_up(cause: Caus
     assert choices(alone)[:4] == choices(after)
 
 
-def test_a_damaged_run_says_nothing_of_its_setting(tmp_path: Path) -> None:
+def test_a_run_that_cannot_be_read_says_nothing_of_its_setting(tmp_path: Path) -> None:
     made = plan_search(write_tune(tmp_path), tmp_path / "runs")
     first, *others = open_runs(made.manifest)
     for run in others:
@@ -371,7 +371,7 @@ def test_a_damaged_run_says_nothing_of_its_setting(tmp_path: Path) -> None:
     ledger = made.grid.ledger(first)
     ledger.folder.mkdir(parents=True, exist_ok=True)
     ledger.status_file.write_text("{}")
-    with pytest.raises(HeldUpError, match=f"damaged, which says nothing of its setting.*{ledger.status_file}"):
+    with pytest.raises(HeldUpError, match=f"unreadable, which says nothing of its setting.*remove {ledger.folder}"):
         advance(made.grid, made.manifest)
 
 

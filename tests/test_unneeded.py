@@ -45,6 +45,12 @@ print(tuple(normal.expand((3,)).rsample().shape), torch._refs.__file__ is not No
 print(len(torch._decomp.decomposition_table) > 100, torch._custom_ops.__file__ is not None)
 import torch._refs
 """
+PICKLES = """
+import importlib.util, cloudpickle
+exports = torch.export
+print([importlib.util.find_spec(name).origin.endswith("__init__.py") for name in ("torch.export", "torch._dynamo")])
+print(cloudpickle.loads(cloudpickle.dumps(lambda: exports.Dim("batch").__name__))())
+"""
 LOGS = """
 import tempfile
 from pathlib import Path
@@ -90,6 +96,16 @@ def test_who_exports_or_logs_has_what_it_takes() -> None:
 
 def test_what_torch_reaches_without_importing_it_is_there() -> None:
     assert said(TRAINS + REACHES)[1:] == ["(3, 2)", "(3, 2) True", "True True"]
+
+
+def test_torch_may_ask_for_its_compiler_while_it_is_imported() -> None:
+    """As it does for debugging, and in the hooks of backends."""
+    debugging = "import os; os.environ['TORCH_COMPILE_DEBUG'] = '1'\n"
+    assert said(debugging + TRAINS)[0].startswith("[0.5, 0.5, 0.5]")
+
+
+def test_what_stands_in_is_found_and_pickled_as_a_module_is() -> None:
+    assert said(TRAINS + PICKLES)[1:] == ["[True, True]", "batch"]
 
 
 def test_a_script_that_imports_torch_has_all_of_it() -> None:

@@ -117,9 +117,9 @@ def rehearse(
             head = RayHead(folder / "ray", AT_A_TIME * 2, environment, folder / "head.log")
             with ThreadPoolExecutor() as pool, _ended_at_once(mark, server, head):
                 list(pool.map(stack.enter_context, (server, head)))
-            stack.enter_context(_ended_at_once(mark, server, head))  # on the way out this comes before their own ends
             write = functools.partial(_grid_file, folder, runs, {**settings, "budget.steps": steps}, base)
             alone = stack.enter_context(_alone(folder, write("alone", None), environment))
+            stack.enter_context(_ended_at_once(mark, server, head))  # on the way out this comes before their own ends
             rehearsal = _Rehearsal(folder, write("chaos", server.address), head, server, mark, result, say)
             start = time.monotonic()
             try:

@@ -15,8 +15,11 @@ _END_SECONDS = 5.0  # for what is asked to end
 
 
 def completed(words: Sequence[str], **how: Any) -> subprocess.CompletedProcess[str]:
-    """As `subprocess.run`, with output as text; where we are to end meanwhile, all that it has started ends, too."""
-    running = subprocess.Popen(words, text=True, **how)
+    """As `subprocess.run`, with output as text; where we are to end meanwhile, all that it has started ends, too.
+
+    Ctrl-C reaches us alone: a child that it ended first could leave what it has started.
+    """
+    running = subprocess.Popen(words, text=True, start_new_session=True, **how)
     try:
         output, errors = running.communicate()
     finally:

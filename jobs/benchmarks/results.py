@@ -13,21 +13,30 @@ from rich.console import Console
 
 def can_be_written(file: Path | None) -> Path | None:
     """A file's path as it is. Raises BadParameter, before anything is measured, where nothing can be written there."""
-    if file is not None and file.is_dir():
-        raise typer.BadParameter(f"{file} is a folder; name a file")
-    if file is not None and not file.absolute().parent.is_dir():
-        raise typer.BadParameter(f"there is no folder {file.absolute().parent}")
-    if file is not None and not os.access(file if file.exists() else file.absolute().parent, os.W_OK):
+    try:
+        if file is not None and file.is_dir():
+            raise typer.BadParameter(f"{file} is a folder; name a file")
+        if file is not None and not file.absolute().parent.is_dir():
+            raise typer.BadParameter(f"there is no folder {file.absolute().parent}")
+        writable = file is None or os.access(file if file.exists() else file.absolute().parent, os.W_OK)
+    except OSError:  # below a folder that may not be looked into
+        writable = False
+    if not writable:
         raise typer.BadParameter(f"{file} cannot be written")
     return file
 
 
 def can_be_a_folder(folder: Path | None) -> Path | None:
     """A folder's path as it is. Raises BadParameter, before anything is measured, where something else is there."""
-    there = None if folder is None else next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if there is not None and not there.is_dir():
-        raise typer.BadParameter(f"{there} is no folder")
-    if there is not None and not os.access(there, os.W_OK):
+    if folder is None:
+        return None
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        if not there.is_dir():
+            raise typer.BadParameter(f"{there} is no folder")
+    except OSError:  # below a folder that may not be looked into
+        raise typer.BadParameter(f"{folder} cannot be written to") from None
+    if not os.access(there, os.W_OK):
         raise typer.BadParameter(f"{there} cannot be written to")
     return folder
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -100,15 +101,18 @@ class Run:
 
 def _meant(folder: Path) -> str:
     """What to do with a folder that is no run's, if it is something else of ours; else empty."""
-    if (folder / MANIFEST).is_file():
-        if Grid(folder).manifest().search is not None:
-            return f"it is a search's: `space-dist tune report {folder}` reports on it"
-        what = "it is a grid's, of runs"
-    elif any(folder.glob("*/status.json")):
-        what = "there are runs below it"
-    else:
+    try:
+        if (folder / MANIFEST).is_file():
+            if Grid(folder).manifest().search is not None:
+                return f"it is a search's: `space-dist tune report {shlex.quote(str(folder))}` reports on it"
+            what = "it is a grid's, of runs"
+        elif any(folder.glob("*/status.json")):
+            what = "there are runs below it"
+        else:
+            return ""
+        first = next(map(str, sorted(file.parent for file in folder.glob("**/status.json"))), "")
+    except (OSError, LedgerError):  # not to be read, or no manifest of ours
         return ""
-    first = next(map(str, sorted(file.parent for file in folder.glob("**/status.json"))), "")
     return f"{what}: space_dist.report_on({str(folder)!r}) reports on them" + (
         f", Run({first!r}) is one" if first else ""
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import logging
 import time
@@ -14,7 +15,7 @@ import typer
 
 from space_dist.cli.overview import display, print_cells, print_failures, status_json, summary, tell, workers_in_words
 from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one_of, output_left, say, warn
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import ConfigError, LedgerError, SpaceDistError
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile
 
@@ -319,17 +320,27 @@ def grid_retry(
     for name in sorted(causes):
         one_of(known, name, "--cause")
     place, manifest = _found(grid, root)
-    chosen = [run_status for run_status in run_statuses_of(place, manifest)
-              if run_status.condition == "failed" and run_status.cause in causes]  # fmt: skip
-    damaged = [run_status for run_status in chosen if run_status.cause is Cause.DAMAGED]
-    for run_status in damaged:
-        say(f"{run_status.run.title}: {run_status.detail}; {run_status.way_out}")
-    forgiven = [run_status for run_status in chosen if run_status not in damaged]
-    for run_status in forgiven:
-        Attempts(run_status.ledger).forgive()
-        say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
+    forgiven = 0
+    for run_status in run_statuses_of(place, manifest):
+        failed = run_status.condition == "failed" and run_status.cause in causes
+        looked_into = Cause.UNREADABLE in causes and (failed or run_status.condition == "done")
+        if what := _unreadable(run_status) if looked_into else "":
+            told = dataclasses.replace(run_status, cause=Cause.UNREADABLE)
+            say(f"{run_status.run.title}: {what}; {told.way_out}")
+        elif failed:
+            Attempts(run_status.ledger).forgive()
+            say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
+            forgiven += 1
     follow_up = "" if not forgiven else f"; `space-dist grid run {place.folder}` or `grid submit` does it"
-    say(f"{len(forgiven)} runs may be tried again{follow_up}")
+    say(f"{forgiven} runs may be tried again{follow_up}")
+
+
+def _unreadable(run_status: RunStatus) -> str:
+    """The first of what a run has written and nobody can read any more; empty if that is nothing."""
+    try:
+        return next(iter(run_status.ledger.damage()), "")
+    except LedgerError as error:  # its status
+        return str(error)
 
 
 @grid_app.command("work", hidden=True)

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, say, warn, write
-from space_dist.errors import ConfigError, LedgerError, NotPlannedError, about, exits_refused
+from space_dist.errors import ConfigError, about, exits_refused
 
 if TYPE_CHECKING:
     from space_dist.experiment.manifest import Grid
@@ -222,10 +222,7 @@ def _grid(path: Path, root: Path | None, scale: float, changes: Sequence[str]) -
     from space_dist.experiment.manifest import find_grid
     from space_dist.system.workplace import workplace
 
-    try:
-        return find_grid(path, workplace() / "runs" if root is None else root, scale, changes)
-    except NotPlannedError as error:  # 1, as where there are no runs: here 1 does not stand for failed runs
-        raise LedgerError(str(error)) from None
+    return find_grid(path, workplace() / "runs" if root is None else root, scale, changes)
 
 
 def print_report(result: Report, to: Console) -> None:
@@ -291,13 +288,18 @@ def sync(
 ) -> None:
     """Replay runs and grids into MLflow. Doing it twice changes nothing."""
     from space_dist.config import located
-    from space_dist.experiment.manifest import find_grid
+    from space_dist.experiment.manifest import MANIFEST, find_grid
     from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs
 
     named = [located(path) for path in runs]
-    paths = [find_grid(path, root).folder if path.is_file() else path for path in named]
+    paths = [
+        find_grid(path, root).folder
+        if path.is_file() or (not path.exists() and (root / path / MANIFEST).is_file())
+        else path
+        for path in named
+    ]
     found = find(paths)
     if follow:
         result = follow_runs(paths, uri, experiment)

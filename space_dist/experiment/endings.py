@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from space_dist.errors import ConfigError, Interrupted, RunLockedError, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, RunLockedError, SpaceDistError, UnreadableError
 
 _ELSEWHERE = "another process is working on it"
 _LINES = 6  # of what is told of a crash: its words, and what its process printed last
@@ -28,7 +28,7 @@ class Cause(StrEnum):
     NODE_LOST = "node_lost"
     TIMEOUT = "timeout"
     CRASH = "crash"
-    DAMAGED = "damaged"  # a file of its folder, by whatever hand: no attempt of it can mend that
+    UNREADABLE = "unreadable"  # files of its folder, by whatever hand: no attempt of it can mend that
     KILLED = "killed"
     STOPPED = "stopped"  # on the user's own request; not a failure
 
@@ -45,7 +45,7 @@ _WORDS = {
     Cause.NODE_LOST: "node lost",
     Cause.TIMEOUT: "timeout",
     Cause.CRASH: "crash",
-    Cause.DAMAGED: "damaged",
+    Cause.UNREADABLE: "unreadable",
     Cause.KILLED: "killed by an unknown hand",
     Cause.STOPPED: "stopped",
 }
@@ -152,7 +152,7 @@ def why_ended(seen: Evidence) -> Ended:
     if seen.held or seen.job_succeeded:
         return Busy(None, _ELSEWHERE)
     if seen.damage:
-        return Ended(Cause.DAMAGED, seen.damage)
+        return Ended(Cause.UNREADABLE, seen.damage)
     if code is None:
         return _not_seen_to_end(seen)
     knows = said is not None and code != Interrupted.exit_code
@@ -196,6 +196,8 @@ def _ended_by_itself(seen: Evidence, code: int) -> Ended:
         return Ended(Cause.PREEMPTED, message)
     if code == ConfigError.exit_code:
         return _with_output(Cause.CONFIG_ERROR, message, seen)
+    if error == UnreadableError.__name__:
+        return Ended(Cause.UNREADABLE, message)
     if error == MemoryError.__name__ or (code == -signal.SIGKILL and seen.oom_killed):
         return Ended(Cause.OUT_OF_MEMORY, message or "the system had no memory left, and killed it")
     if code == -signal.SIGKILL:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -172,10 +173,11 @@ class RunStatus:
     @property
     def way_out(self) -> str:
         """What lets a failed run be tried again."""
-        if self.cause is Cause.DAMAGED:
-            return f"restore the file; or remove {self.ledger.status_file}, and it goes on from its newest checkpoint"
-        grid = self.ledger.folder.parent.parent
-        return f"`space-dist grid retry {grid} --cause {self.cause}` lets it be tried again"
+        folder = self.ledger.folder
+        again = f"`space-dist grid retry {shlex.quote(str(folder.parent.parent))} --cause {self.cause}`"
+        if self.cause is Cause.UNREADABLE:
+            return f"restore what cannot be read, and {again} lets it go on; or remove {folder}, and it begins anew"
+        return f"{again} lets it be tried again"
 
     @property
     def in_words(self) -> str:
@@ -186,7 +188,7 @@ class RunStatus:
 
 
 def run_status_of(run: Run, ledger: Ledger, retry: Retry, code: str) -> RunStatus:
-    """Where a run stands now. `code` is this package's digest. A damaged ledger is a failed run that says so."""
+    """Where a run stands now. `code` is this package's digest. One that cannot be read is a failed run that says so."""
     history = Attempts(ledger).history()
     budget = run.cell.steps_to_take
     try:
@@ -252,7 +254,7 @@ def may_retry(cause: Cause, ends: Mapping[Cause, int], retry: Retry) -> bool:
     """Whether a run that ended so may be tried again. `ends` counts the ends by cause, this one included if known."""
     if cause is Cause.STOPPED:
         return True
-    allowed = {**retry.model_dump(), Cause.CONFIG_ERROR: 0, Cause.DAMAGED: 0}
+    allowed = {**retry.model_dump(), Cause.CONFIG_ERROR: 0, Cause.UNREADABLE: 0}
     return ends.get(cause, 0) <= int(allowed[cause])
 
 

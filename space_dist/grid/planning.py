@@ -89,7 +89,7 @@ class InstanceFiles:
 
     def sets(self, blueprint: Blueprint) -> tuple[InstanceSet, InstanceSet]:
         files = blueprint.config.instances
-        key = (files.train, files.test, blueprint.spec.context_bounds)
+        key = (files.train, files.test, blueprint.spec.context_bounds, blueprint.config.columns_read)
         if key not in self._read:
             self._read[key] = blueprint.instances()
         return self._read[key]

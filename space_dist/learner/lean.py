@@ -8,7 +8,7 @@ holds losses, gradients, norms and weights against `PPO.train`.
 
 from __future__ import annotations
 
-import functools
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -49,10 +49,21 @@ class LeanPPO(PPO):
         self.rollout_buffer_class = LeanBuffer
         super()._setup_model()
 
-    @functools.cached_property
+    _network: Network | None = None
+
+    @property
     def network(self) -> Network:
         """The policy, as the kernel takes it."""
-        return Network(self.policy)
+        if self._network is None or not self._network.is_of(self.policy):
+            self._network = Network(self.policy)
+        return self._network
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is laid out for the kernel: a copy has a policy of its own."""
+        return {name: value for name, value in self.__dict__.items() if name != "_network"}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_network"]
 
     def train(self) -> None:
         """Update from the rollout buffer as `PPO.train` does, and record the same metrics."""
@@ -135,9 +146,24 @@ class Network:
         self._dtype, self._shape = weight.detach().numpy().dtype, shape_of(policy)
         sizes = [parameter.numel() for parameter in self._parameters]
         self._numbers = np.zeros((3, sum(sizes)), dtype=self._dtype)
-        self._weights, self._means, self._squares = (
+        ends = np.cumsum([0, *sizes])
+        self._places = [slice(*ends_of_one) for ends_of_one in itertools.pairwise(ends)]
+        self._addresses = [self._numbers[0, place].ctypes.data for place in self._places]
+        self._means, self._squares = (
             [part.view_as(parameter) for part, parameter in zip(torch.split(row, sizes), self._parameters, strict=True)]
-            for row in torch.from_numpy(self._numbers)
+            for row in torch.from_numpy(self._numbers[1:])
+        )
+
+    def is_of(self, policy: Any) -> bool:
+        """Whether it is laid out for this policy as it is now: its tensors may be others, but not of another type."""
+        theirs = tuple(policy.parameters())
+        return (
+            self._policy is policy
+            and len(theirs) == len(self._parameters)
+            and all(
+                one is mine and one.detach().numpy().dtype == self._dtype
+                for one, mine in zip(theirs, self._parameters, strict=True)
+            )
         )
 
     def packed(
@@ -187,10 +213,10 @@ class Network:
         return max((int(one["step"]) for one in state.values()), default=0)
 
     def _gather_weights(self) -> None:
-        for parameter, weight in zip(self._parameters, self._weights, strict=True):
-            if parameter.data_ptr() != weight.data_ptr():
-                weight.copy_(parameter.detach())
-                parameter.data = weight
+        for parameter, place, address in zip(self._parameters, self._places, self._addresses, strict=True):
+            if parameter.data_ptr() != address:
+                self._numbers[0, place] = parameter.detach().numpy().ravel()
+                parameter.data = torch.from_numpy(self._numbers[0, place]).view_as(parameter)
 
     def _keep(self, layout: Layout, parts: Array, steps: int) -> None:
         """Give policy and optimiser their numbers, and the views of Adam's."""

@@ -18,6 +18,7 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Callable
+from importlib.machinery import PathFinder
 from importlib.metadata import version
 from types import ModuleType
 from typing import Any, Final
@@ -33,6 +34,9 @@ _REACHED: Final = ("torch._custom_op.impl", "torch._custom_ops", "torch._decomp"
 
 class _StandIn(ModuleType):
     """A module of torch's that nobody has asked for anything yet."""
+
+    def __reduce_ex__(self, _: Any) -> tuple[Callable[[str], ModuleType], tuple[str]]:
+        return importlib.import_module, (self.__name__,)  # as modules are pickled: by name
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") and name != "__path__":  # whoever looks through all modules; not an import of a part
@@ -71,14 +75,20 @@ def _hparams(*args: Any, **kwargs: Any) -> Any:
 
 def _stand_in() -> None:
     """Take the places of what has not been imported, and import torch and Stable-Baselines3."""
-    if "torch" not in sys.modules and version("torch").startswith(_SEEN_TO_WORK_WITHOUT_TRACERS):
+    first = "torch" not in sys.modules
+    # Before torch, whose import may already import it: for debugging, or in the hooks of other people's backends.
+    sys.modules.setdefault(COMPILER, _Compiler(COMPILER))
+    if first and version("torch").startswith(_SEEN_TO_WORK_WITHOUT_TRACERS):
         for name in TRACERS:
             sys.modules.setdefault(name, _StandIn(name))
         importlib.import_module(_GENERATORS)
         for name in _REACHED:  # only as attributes: an import of one is an import
             package, _, attribute = name.rpartition(".")
-            setattr(sys.modules[package], attribute, _StandIn(name))
-    sys.modules.setdefault(COMPILER, _Compiler(COMPILER))
+            if name not in sys.modules:
+                setattr(sys.modules[package], attribute, _StandIn(name))
+        for name in {*TRACERS, COMPILER}:
+            if isinstance(stand_in := sys.modules[name], _StandIn):
+                stand_in.__spec__ = PathFinder.find_spec(name, sys.modules["torch"].__path__)
     summary = f"{_LOGS}.summary"
     if not {_LOGS, "stable_baselines3"} & set(sys.modules) and importlib.util.find_spec("tensorboard"):
         # Stable-Baselines3 takes these two names from there and calls them when it logs.

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from numpy.typing import NDArray
 
-from space_dist.errors import LedgerError
+from space_dist.errors import LedgerError, UnreadableError
 from space_dist.ledger.checkpoint import (
     Checkpoint,
     Segment,
@@ -146,8 +146,8 @@ class RunWriter:
     def restore(self) -> Checkpoint | None:
         """Cut every row file back to the newest intact checkpoint and return it; to nothing where none was written.
 
-        Raises LedgerError, and changes nothing, if something cannot be read that may be intact, if there are
-        checkpoints but none fits what is there, and if the status names one but there is none.
+        Raises LedgerError, and changes nothing, if something cannot be read that may be intact, and UnreadableError if
+        there are checkpoints but none fits what is there, or if the status names one but there is none.
         """
         files = self.ledger.checkpoint_files()
         named = None if self.status is None else self.status.checkpoint
@@ -170,7 +170,7 @@ class RunWriter:
                     newer.unlink()
             return checkpoint
         if reasons:
-            raise LedgerError(
+            raise UnreadableError(
                 f"{self.ledger.folder} cannot be resumed: no checkpoint is intact ({'; '.join(reasons)}). "
                 "Nothing was changed; start the run in another folder"
             )

@@ -167,10 +167,10 @@ def _not_comparable(runs: Sequence[tuple[Cell, Run]], manifest: Manifest) -> dic
             with contextlib.suppress(LedgerError):  # a copy that is lost says nothing
                 of_file[run.ledger.folder] = hashlib.sha256(run.ledger.read(run.ledger.instances(split))).hexdigest()
         for file, found in digests.items():
-            if len(counts := Counter(found.values())) < 2:
+            if not found:
                 continue
             frozen = manifest.instances.get(Path(file).name)
-            right = frozen if frozen in counts else counts.most_common(1)[0][0]
+            right = Counter(found.values()).most_common(1)[0][0] if frozen is None else frozen
             reasons |= {
                 folder: f"the instances that it was {'trained' if split == 'train' else 'tested'} on are not those of "
                 f"the grid ({file})"

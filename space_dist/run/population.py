@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from space_dist.config import RunConfig
-from space_dist.envs import BatchedEnv, close
+from space_dist.envs import BatchedEnv, close, unwrapped
+from space_dist.envs.interface import Closable
 from space_dist.errors import SpaceDistError, exits_refused
 from space_dist.learner import PopulationLearner, learn_together
 from space_dist.rollout import Outcomes, Rollout, Setup, Shard, Split, Stage, Trial, collect, evaluate
@@ -182,6 +183,8 @@ class _Workshop:
     def __init__(self) -> None:
         self._spare: dict[Hashable, list[BatchedEnv]] = {}  # by batch and slots; the latest used is last
         self._stages: dict[tuple[ShardKey, ...], tuple[Hashable, Stage]] = {}  # in which these shards' episodes go on
+        self._n_parts: dict[Hashable, int] = {}  # of each batch that is evaluated
+        self._costly: set[Hashable] = set()  # batches whose environments hold more than memory
 
     def answers(self, waiting: Mapping[Path, Wait]) -> dict[Path, Any]:
         """The values that each member waits for; an exception for one whose work failed."""
@@ -204,30 +207,42 @@ class _Workshop:
         batches: dict[Hashable, list[_Promise]] = defaultdict(list)
         for promise in promises:
             batches[promise.batch].append(promise)
-        for batch, promised in batches.items():
-            # In the same order every round, whoever was answered first: else episodes would be played again.
-            for number, some in enumerate(_parts(sorted(promised, key=lambda promise: promise.shard_key or ("", 0)))):
+        # In the same order every round, whoever was answered first: else episodes would be played again.
+        parts = {batch: _parts(sorted(promised, key=lambda promise: promise.shard_key or ("", 0)))
+                 for batch, promised in batches.items()}  # fmt: skip
+        self._n_parts |= {batch: len(parts[batch]) for batch, promised in batches.items()
+                          if promised[0].shard_key is None}  # fmt: skip
+        for batch, several in parts.items():
+            for number, some in enumerate(several):
                 try:
                     with exits_refused():
-                        self._compute(batch, some, number)
+                        self._compute(batch, some, number if self._has_own(batch) else 0)
                 except Exception:  # somebody's environment may raise anything: whose was it?
                     self._compute_apart(batch, some)
 
     def _compute(self, batch: Hashable, promised: Sequence[_Promise], number: int = 0) -> None:
-        """number: of these among the parts of a batch."""
+        """number: of the environments, of several of one size, in which these are computed."""
         setup, works = promised[0].setup, [promise.work for promise in promised]
-        # A part of its own environments: an evaluation plays the same episodes as the one before it, and what an
-        # environment has drawn for an episode it need not draw again.
-        key = (batch, sum(promise.slots for promise in promised), number % _KEPT)
+        key = (batch, sum(promise.slots for promise in promised), number)
         values: Sequence[Any]
         if rollouts := [work for work in works if isinstance(work, Rollout)]:
             values = collect(self._stage(key, promised), rollouts, length=setup.slot_length)
         else:
             env = self._env(key, promised)
+            if isinstance(unwrapped(env), Closable):
+                self._costly.add(batch)
             self._keep_spare(key, env)  # before it may fail, and is closed with the others
             values = evaluate(env, [work for work in works if isinstance(work, Trial)])
         for promise, value in zip(promised, values, strict=True):
             promise.value = value
+
+    def _has_own(self, batch: Hashable) -> bool:
+        """Whether each part of an evaluation has environments of its own, which are kept.
+
+        An evaluation plays the same episodes as the one before it, and what an environment has drawn for an episode it
+        need not draw again. But no more are kept than some, and of those that are costly one of each size.
+        """
+        return batch in self._n_parts.keys() - self._costly and sum(self._n_parts.values()) <= _KEPT
 
     def _compute_apart(self, batch: Hashable, promised: Sequence[_Promise]) -> None:
         for promise in promised:
@@ -275,8 +290,8 @@ class _Workshop:
         close(env)
 
 
-def _parts(promised: Sequence[_Promise]) -> Iterator[Sequence[_Promise]]:
+def _parts(promised: Sequence[_Promise]) -> list[list[_Promise]]:
     """Equal parts that fit the cache."""
     count = -(-sum(promise.slots for promise in promised) // _SLOTS)
-    for places in np.array_split(np.arange(len(promised)), min(count, len(promised))):
-        yield [promised[place] for place in places]
+    split = np.array_split(np.arange(len(promised)), min(count, len(promised)))
+    return [[promised[place] for place in places] for places in split]

@@ -17,7 +17,7 @@ from space_dist.ledger import METRICS, Ledger, Row, Status, decode_row
 from space_dist.system.provenance import code_digest
 
 # The others were ended from outside.
-_OWN_FAULTS: Final = (Cause.CONFIG_ERROR, Cause.OUT_OF_MEMORY, Cause.CRASH, Cause.DAMAGED)
+_OWN_FAULTS: Final = (Cause.CONFIG_ERROR, Cause.OUT_OF_MEMORY, Cause.CRASH, Cause.UNREADABLE)
 _TAIL_BYTES: Final = 64 << 10
 
 Signature = tuple[Any, ...]
