@@ -119,11 +119,16 @@ fi
 """
 
 
+@pytest.mark.parametrize("linked", [False, True])
 def test_a_job_whose_ray_never_comes_up_ends_after_a_few_tries(
-    manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
+    linked: bool, manifest: Manifest, stubs: Stubs, tmp_path: Path, short: str
 ) -> None:
     """Its nodes' step ends at once each time. A try in which a run began, and a job of another number, count anew."""
     folder = write(Export(manifest, profile(temp=short), "cluster"), tmp_path / "x")
+    if linked:  # a run's folder may lie elsewhere
+        (tmp_path / "elsewhere").mkdir()
+        (folder / "cell").mkdir()
+        (folder / "cell/s0").symlink_to(tmp_path / "elsewhere")
     (stubs.folder / "space-dist").unlink()
     (stubs.folder / "space-dist").write_text(RAYLESS)
     (stubs.folder / "space-dist").chmod(0o755)
