@@ -22,6 +22,7 @@ from space_dist.errors import (  # noqa: E402
     NotPlannedError,
     RunLockedError,
     SpaceDistError,
+    UnreadableError,
 )
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ __all__ = [
     "RunConfig",
     "RunLockedError",
     "SpaceDistError",
+    "UnreadableError",
     "__version__",
     "load_policy",
     "measure_headroom",

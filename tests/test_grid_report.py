@@ -453,7 +453,7 @@ def test_the_command_knows_a_grid(
         code, text = command(monkeypatch, capsys, *words)
         assert (code, complaint in text) == (2, True), text
     code, text = command(monkeypatch, capsys, file, "--root", tmp_path)
-    assert (code, "grid plan" in text) == (1, True)
+    assert (code, "grid plan" in text) == (2, True)
 
 
 def test_an_unwritable_folder_is_one_sentence(grid: Grid, tmp_path: Path) -> None:

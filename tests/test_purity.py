@@ -72,7 +72,7 @@ def test_each_error_ends_a_command_with_its_documented_code():
     # 2: retrying cannot help. 75: EX_TEMPFAIL, "requeue me". 1: anything else. 0 would be success.
     codes = {name: getattr(space_dist, name).exit_code for name in errors_exported()}
     assert codes == {"SpaceDistError": 1, "ConfigError": 2, "LedgerError": 1, "NotPlannedError": 2,
-                     "RunLockedError": 1, "Interrupted": 75}  # fmt: skip
+                     "RunLockedError": 1, "UnreadableError": 1, "Interrupted": 75}  # fmt: skip
 
 
 def test_a_command_looks_for_garbage_seldom_and_whoever_imports_us_as_ever():

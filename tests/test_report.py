@@ -39,9 +39,10 @@ STEPS = 1000  # of one iteration
 
 
 def start_run(
-    folder: Path, *, name: str = "space", seed: int = 0, n: int = 4, eta: float = 0.1, uri: str | None = None
-) -> Ledger:
-    """A run that was started and wrote nothing yet, as the launcher leaves it."""
+    folder: Path, *, name: str = "space", seed: int = 0, n: int = 4, eta: float = 0.1, uri: str | None = None,
+    sets: Sequence[str] | None = None,
+) -> Ledger:  # fmt: skip
+    """A run that was started and wrote nothing yet, as the launcher leaves it; on these training and test `sets`."""
     config = {
         "name": name,
         "seed": seed,
@@ -54,9 +55,9 @@ def start_run(
         "tracking": {"uri": uri, "experiment": "tests"},
         "resources": {"workers": seed},
     }
-    train, test = ("".join(f"{i},{i + offset}.5\n" for i in range(n)) for offset in (0, 100))
+    train, test = sets or ["id,gate\n" + "".join(f"{i},{i + offset}.5\n" for i in range(n)) for offset in (0, 100)]
     with RunWriter(Ledger(folder)) as writer:
-        writer.write_config(to_yaml(config), f"id,gate\n{train}", f"id,gate\n{test}")
+        writer.write_config(to_yaml(config), train, test)
         writer.set_status(
             Status(
                 "running",

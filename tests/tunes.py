@@ -61,7 +61,8 @@ def end(grid: Grid, run: Run, outcome: Outcome) -> None:
         Attempts(ledger).begin(1, {})
         Attempts(ledger).end(1, Ended(outcome, "the ground gave way"))
         return
-    start_run(ledger.folder, seed=run.seed)
+    sets = [(grid.folder / run.cell.config["instances"][split]).read_text() for split in ("train", "test")]
+    start_run(ledger.folder, seed=run.seed, sets=sets)
     continue_run(ledger, [-9.0, outcome], [[0]], state="done", success=0.5)
 
 
