@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -19,7 +20,7 @@ from tests.patience import PATIENCE
 sys.path.append(str(ROOT / "jobs"))
 
 from benchmarks.chaos import _ended_at_once
-from benchmarks.processes import MARK, marked
+from benchmarks.processes import MARK, completed, marked
 from benchmarks.servers import _Server, until
 
 SLEEPS = [sys.executable, "-c", "import time; time.sleep(1000)"]
@@ -110,4 +111,19 @@ processes.completed([sys.executable, "-c", {child!r}])
     assert len(marked(mark)) == 3
     os.killpg(process.pid, told)  # as a terminal does it
     assert process.wait(PATIENCE) == 143
+    assert marked(mark) == []
+
+
+def test_a_child_that_was_just_started_ends_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signal comes when the child is there, and `Popen` has not returned."""
+
+    class Interrupted(subprocess.Popen[str]):
+        def __init__(self, *words: Any, **how: Any) -> None:
+            super().__init__(*words, **how)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", Interrupted)
+    mark = f"test-{os.getpid()}-started"
+    with pytest.raises(KeyboardInterrupt):
+        completed(SLEEPS, env={**os.environ, MARK: mark})
     assert marked(mark) == []

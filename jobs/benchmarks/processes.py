@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import psutil
@@ -15,25 +15,42 @@ _END_SECONDS = 5.0  # for what is asked to end
 
 
 def completed(words: Sequence[str], **how: Any) -> subprocess.CompletedProcess[str]:
-    """As `subprocess.run`, with output as text; where we are to end meanwhile, all that it has started ends, too.
-
-    Ctrl-C reaches us alone: a child that it ended first could leave what it has started.
-    """
-    running = subprocess.Popen(words, text=True, start_new_session=True, **how)
-    try:
+    """As `subprocess.run`, with output as text; where we are to end meanwhile, all that it has started ends, too."""
+    with all_ended():
+        running = subprocess.Popen(words, text=True, start_new_session=True, **how)
         output, errors = running.communicate()
+    return subprocess.CompletedProcess(words, running.returncode, output, errors)
+
+
+@contextlib.contextmanager
+def all_ended() -> Iterator[None]:
+    """Children that this block starts, and theirs, end with it at the latest.
+
+    Start them in sessions of their own: Ctrl-C must reach us alone, for a child that it ended first could leave what it
+    has started. A signal may also come before `Popen` has returned: so we look for who is there, and need no `Popen`.
+    """
+    us = psutil.Process()
+    before = us.children()
+    try:
+        yield
     finally:
-        if running.poll() is None:
-            top = psutil.Process(running.pid)
-            everybody = [top, *top.children(recursive=True)]
-            top.terminate()  # a grid has its runs end
+        if children := [child for child in us.children() if child not in before]:
+            everybody = [*children, *(one for child in children for one in _descendants(child))]
+            for child in children:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    child.terminate()  # a grid has its runs end
             psutil.wait_procs(everybody, timeout=_END_SECONDS)
-            everybody += [one for parent in everybody if is_live(parent) for one in parent.children(recursive=True)]
+            everybody += [one for parent in everybody for one in _descendants(parent)]
             for process in everybody:
                 with contextlib.suppress(psutil.NoSuchProcess):
                     process.kill()
-            running.wait()
-    return subprocess.CompletedProcess(words, running.returncode, output, errors)
+            psutil.wait_procs(everybody, timeout=_END_SECONDS)
+
+
+def _descendants(process: psutil.Process) -> list[psutil.Process]:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return process.children(recursive=True)
+    return []
 
 
 def is_named(process: psutil.Process, word: str) -> bool:

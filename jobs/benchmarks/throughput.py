@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib.util
 import json
 import os
-import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -22,6 +20,7 @@ import typer
 from rich.console import Console
 
 from benchmarks.contenders import TASKS, XLA_FLAGS, Contender, specification
+from benchmarks.processes import all_ended
 from benchmarks.results import JsonFile, can_be_a_folder, can_be_written, keep
 from space_dist import config as configs
 from space_dist.arithmetic import SETTINGS
@@ -392,8 +391,8 @@ def _jax_seconds(contender: Contender, member_steps: int) -> float:
 
 def _together(wanted: Sequence[tuple[str, Contender]], patience: float | None = None) -> list[dict[str, float]]:
     """What so many processes at once have found; nothing if they take longer than `patience` seconds."""
-    with contextlib.ExitStack() as running:
-        processes = [running.enter_context(_started(asked, one.first, one.checkout)) for asked, one in wanted]
+    with all_ended():
+        processes = [_start(asked, one.first, one.checkout) for asked, one in wanted]
         try:
             return [_finish(process, one, patience) for process, (one, _) in zip(processes, wanted, strict=True)]
         except subprocess.TimeoutExpired:
@@ -402,20 +401,8 @@ def _together(wanted: Sequence[tuple[str, Contender]], patience: float | None = 
 
 def process(wanted: str, first: str, checkout: str = "") -> dict[str, float]:
     """What one process of `contenders` finds, which does something else `first`; of another version, if wanted."""
-    with _started(wanted, first, checkout) as running:
-        return _finish(running, wanted)
-
-
-@contextlib.contextmanager
-def _started(wanted: str, first: str, checkout: str) -> Iterator[subprocess.Popen[str]]:
-    """A process, which ends with this block at the latest, and with it whatever it has started."""
-    running = _start(wanted, first, checkout)
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            os.killpg(running.pid, signal.SIGKILL)
-            running.wait()
+    with all_ended():
+        return _finish(_start(wanted, first, checkout), wanted)
 
 
 def _start(wanted: str, first: str, checkout: str) -> subprocess.Popen[str]:
