@@ -68,7 +68,7 @@ def chaos(
     runs: Annotated[int, typer.Option(min=1, help="Runs of the grid.")] = 8,
     steps: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(min=5_120, help="Environment steps of each run; default: 184,320, of a population 921,600."),
+        typer.Option(min=5_120, help="Environment steps of each run; default: 184,320, of a population 3,686,400."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of kinds, moments and victims.")] = 0,
     kind: Annotated[
@@ -83,7 +83,7 @@ def chaos(
         raise ConfigError(f"--kind {unknown[0]!r} is not known{nearest(unknown[0], KINDS)} Allowed: {', '.join(KINDS)}")
     possible = [name for name in KINDS if not (population and name.endswith("actor"))]
     settings = {**SETTINGS, "engine": "population"} if population else SETTINGS
-    steps = steps or (921_600 if population else 184_320)  # enough for so many faults on two cores
+    steps = steps or (3_686_400 if population else 184_320)  # enough for so many faults on two cores
     result = rehearse(
         runs=runs, steps=steps, seed=seed, kinds=kind or possible, count=faults, say=console.print, settings=settings
     )
