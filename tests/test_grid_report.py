@@ -361,6 +361,23 @@ def test_returns_of_different_environments_are_never_mixed(tmp_path: Path) -> No
     assert any("no counterpart of the baseline: env.id=three k=2" in remark for remark in report.remarks)
 
 
+def test_a_task_with_a_base_config_of_its_own_has_a_counterpart_of_the_baseline(tmp_path: Path) -> None:
+    """The cell with the baseline's curriculum and other settings; none where the curriculum is another, or two are."""
+    worlds = [("one", "round_robin", 1), ("one", "uniform", 1), ("two", "uniform", 1), ("two", "round_robin", 1),
+              ("two", "round_robin", 2), ("three", "uniform", 1)]  # fmt: skip
+    points = [{"extends": f"{env}/{kind}.yaml", "k": k} for env, kind, k in worlds]
+    grid = make_grid(tmp_path / "g", points, n_seeds=1)
+    manifest = grid.manifest()
+    made = [dataclasses.replace(cell, config=cell.config | {"env": {"id": env}, "curriculum": {"kind": kind}})
+            for cell, (env, kind, _) in zip(manifest.cells, worlds, strict=True)]  # fmt: skip
+    grid.freeze(dataclasses.replace(manifest, cells=tuple(made)), {})
+    for cell in range(len(worlds)):
+        finish(grid, cell, 0, float(cell))
+    cells = read_cells(grid, grid.manifest())
+    found = compare(cells, cells[0])
+    assert [None if one.reference is None else cells.index(one.reference) for one in found] == [0, 0, 3, 3, 3, None]
+
+
 @pytest.mark.parametrize(
     ("points", "titles"),
     [

@@ -220,7 +220,11 @@ def _reference(cells: Sequence[CellRuns], baseline: CellRuns, task: str) -> Cell
 
 
 def _method(cell: CellRuns) -> dict[str, Any]:
-    return {key: value for key, value in cell.settings.items() if not _is_of_task(key)}
+    """What it does in its task: its settings on the axes, of a base config's the curriculum."""
+    settings = {key: value for key, value in cell.settings.items() if not _is_of_task(key)}
+    if "extends" in settings:  # each task may have a base config of its own
+        settings["extends"] = cell.cell.config.get("curriculum")
+    return settings
 
 
 def _compare(cell: CellRuns, reference: CellRuns | None, threshold: float | None) -> Comparison:
