@@ -9,12 +9,14 @@ import pytest
 
 from space_dist.api.grids import run_grid
 from space_dist.cli.terminal import spread
-from space_dist.errors import ConfigError, LedgerError
+from space_dist.errors import ConfigError, Interrupted, LedgerError
 from space_dist.experiment.manifest import Manifest, find_grid
 from space_dist.grid.planning import plan
 from space_dist.report import build_grid_report
+from tests import prepared
 from tests.commanding import command
 from tests.grids import TINY, write_grid, write_line_instances
+from tests.patience import PATIENCE
 
 
 def test_a_change_is_of_every_cell_and_in_a_folder_of_its_own(tmp_path: Path) -> None:
@@ -68,6 +70,15 @@ def test_changes_that_are_refused_are_named(tmp_path: Path, change: str, said: s
     with pytest.raises(ConfigError, match=said):
         plan(path, tmp_path / "runs", 1.0, [change])
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("second", ["learner.gamma=0.7", "learner={gamma: 0.7}"])
+def test_one_thing_is_changed_once(tmp_path: Path, second: str) -> None:
+    """Else the order would decide, which neither the folder's name nor the report tells."""
+    path, first = write_grid(tmp_path), "learner.gamma=0.5"
+    for changes in ([first, second], [second, first]):
+        with pytest.raises(ConfigError, match="is changed already; change everything once"):
+            plan(path, tmp_path / "runs", 1.0, changes)
 
 
 @pytest.mark.parametrize(
@@ -148,12 +159,33 @@ def test_several_grids_run_one_after_the_other(
         assert {grid.ledger(run).status().state for run in grid.manifest().runs()} == {"done"}
 
 
+def test_a_grid_that_a_stop_came_before_is_named(two: list[Path], tmp_path: Path) -> None:
+    """The first is done, so that its own exit code would be 0."""
+    stop, said = tmp_path / "stop", tmp_path / "said"
+    for words, code in (([two[0]], 0), ([*two, "--stop-file", stop], Interrupted.exit_code)):
+        process = prepared.command(["grid", "run", *words, "--root", tmp_path], said)
+        process.join(PATIENCE)
+        assert process.exitcode == code, said.read_text()
+        stop.touch()
+    assert "stopped before other: run the same command again to go on" in " ".join(said.read_text().split())
+
+
 @pytest.mark.parametrize("words", [["--part", "0-0"], ["--runs", "0123456789abcdef"]])
 def test_what_is_of_one_grid_is_refused_for_two(
     two: list[Path], words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(monkeypatch, "grid", "run", *two, *words, "--root", two[0].parent / "none") == 2
     assert "are of one grid, and here are 2" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("part", ["0", "1-0", f"0-{'9' * 5000}"])
+def test_a_part_that_is_none_is_refused(
+    two: list[Path], part: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(monkeypatch, "grid", "run", two[0], "--part", part, "--root", two[0].parent / "none") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "write FIRST-LAST, like 0-3" in said
+    assert len(said) < 200
 
 
 def test_a_grid_named_twice_is_refused(

@@ -155,6 +155,13 @@ def test_an_output_that_does_not_block_is_waited_for_and_given_up(monkeypatch: p
     os.close(reading)
 
 
+def test_what_a_terminal_cannot_show_ends_no_command() -> None:
+    code = "from space_dist.cli.terminal import keep_outputs; keep_outputs(); print('IQM \u2014 1')"
+    environment = {**os.environ, "PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
+    assert done.stdout == b"IQM ? 1\n"
+
+
 MODULES = {
     "fails_to_import": "raise ImportError('no such library')",
     "divides_at_import": "1 / 0",

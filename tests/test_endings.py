@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import json
+import os
 import re
+import resource
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -18,6 +22,7 @@ from space_dist.experiment import endings
 from space_dist.experiment.endings import Busy, Cause, Ended, Evidence, Said, why_ended
 from space_dist.experiment.manifest import Retry
 from space_dist.experiment.status import may_retry
+from space_dist.grid import supervisor
 from tests.grids import ROOT
 
 DONE, ELSEWHERE = "none: it is done", "none: another process works on it"
@@ -177,3 +182,25 @@ def test_attempts_are_repeated_as_often_as_the_table_says(cause: Cause) -> None:
 
 def test_a_signal_without_a_name_is_told_by_its_number() -> None:
     assert why_ended(Evidence(code=-40)) == Ended(Cause.CRASH, "ended by signal 40")
+
+
+def test_a_run_tells_its_reason_though_its_output_cannot_be_written(tmp_path: Path) -> None:
+    """As on a full disk, which may be the reason."""
+    reading, writing = os.pipe()
+    run: Any = SimpleNamespace(key="cell/s0")
+    pid = os.fork()
+    if not pid:
+        code = 99
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+            reason = errors.LedgerError("the disk is full")
+            code = supervisor._child_main(lambda tell: tell(run, reason), tmp_path / "output.txt", writing)
+        finally:
+            os._exit(code)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        told = [json.loads(line) for line in pipe]
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == errors.LedgerError.exit_code
+    assert [(one["run"], one["error"], one["message"]) for one in told] == [
+        ("cell/s0", "LedgerError", "the disk is full")
+    ]

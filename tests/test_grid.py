@@ -27,6 +27,8 @@ from space_dist.experiment.status import (
 )
 from space_dist.grid.planning import plan
 from space_dist.ledger import Lock
+from space_dist.slurm.export import JOBS
+from space_dist.slurm.queue import queue_of
 from space_dist.system.provenance import source_digest
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
 
@@ -95,6 +97,10 @@ def test_several_bases_and_whole_sections_are_axes(tmp_path: Path) -> None:
         ({"seeds": [1, 1]}, ("seeds", "once")),
         ({"seeds": {"count": 0}}, ("seeds", "greater than or equal to 1")),
         ({"seeds": {"count": 60000}}, ("more than 100,000 runs",)),
+        ({"seeds": 3}, ("seeds: write a list, like [0, 1, 2], or a range", "not 3")),
+        ({"seeds": [0, -1]}, ("seeds.1: -1",)),
+        ({"seeds": {"start": 2**31 - 1, "count": 2}}, ("seeds: the last seed would be 2147483648",)),
+        ({"seeds": {"start": 0, "cout": 2}}, ("seeds.cout", "did you mean 'count'")),
         ({"name": "../x"}, ("name",)),
         ({"nme": "x"}, ("nme", "did you mean 'name'")),
         ({"extends": "nowhere.yaml"}, ("nowhere.yaml", "does not exist")),
@@ -402,3 +408,18 @@ def test_a_stopped_run_lacks_no_explanation(
         said[cause] = capsys.readouterr().out
     assert said[Cause.STOPPED].rstrip().endswith("waiting: stopped")
     assert said[Cause.KILLED].rstrip().endswith("failed: killed by an unknown hand; no more is known")
+
+
+def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:
+    made = plan(write_grid(tmp_path), tmp_path / "runs")
+    grid, ledger = made.grid, made.grid.ledger(made.manifest.runs()[0])
+    ledger.folder.mkdir(parents=True)
+    attempts, instances = Attempts(ledger), grid.instances / next(iter(made.manifest.instances))
+    for path in (attempts.path, instances, grid.folder / JOBS, grid.manifest_file):
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)
+    for read in (attempts.rows, lambda: grid.instance_files(made.manifest), grid.manifest):
+        with pytest.raises(LedgerError, match="is no regular file"):
+            read()
+    assert queue_of(grid.folder) is None
+    assert last_lines(attempts.path) == []

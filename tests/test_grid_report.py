@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import math
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
@@ -292,6 +293,21 @@ def test_a_grid_without_a_finished_run_says_so(tmp_path: Path) -> None:
     assert (report.folder / "curves.png").exists()  # an unfinished curve is better than none, and is labelled so
 
 
+def test_a_report_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:
+    """A grid that was planned anew: its first report was of other cells. What others put there stays."""
+    folder = tmp_path / "g"
+    grid = make_grid(folder, [{"k": 1}], n_seeds=1)
+    finish(grid, 0, 0, 1.0)
+    report = build_grid_report(grid)
+    made = {path.name for path in report.folder.iterdir()}
+    assert {"curves.png", "profiles.png", "curves.csv", "seeds.csv"} <= made
+    (report.folder / "mine.png").touch()
+    shutil.rmtree(grid.ledger(grid.manifest().runs()[0]).folder)
+    build_grid_report(grid)
+    left = {path.name for path in report.folder.iterdir()}
+    assert left == {"mine.png", "cells.csv", "runs.csv", "report.md", "report.html"}
+
+
 def test_a_run_that_cannot_be_read_is_a_failed_one(tmp_path: Path) -> None:
     grid = make_grid(tmp_path / "g", [{"k": 1}, {"k": 2}], n_seeds=2)
     for seed in range(2):
@@ -359,6 +375,9 @@ def test_returns_of_different_environments_are_never_mixed(tmp_path: Path) -> No
     assert pool(cells) == []
     report = build_grid_report(grid)
     assert any("no counterpart of the baseline: env.id=three k=2" in remark for remark in report.remarks)
+    curves = [f"curves_{number}.png" for number in (1, 2, 3)]  # on axes of one scale, two of them were a line each
+    assert sorted(path.name for path in report.folder.glob("curves*.png")) == curves
+    assert all(f"({file})" in report.markdown for file in curves)
 
 
 def test_a_task_with_a_base_config_of_its_own_has_a_counterpart_of_the_baseline(tmp_path: Path) -> None:

@@ -264,7 +264,11 @@ def test_submission_is_all_or_nothing_and_happens_once(manifest: Manifest, stubs
     assert len(stubs.calls("sbatch")) == 4
     code, said = stubs.run(folder / SUBMIT, STUB_QUEUE="103\n")
     assert (code, "already in the queue, nothing to do: 103" in said) == (0, True)
+    code, said = stubs.run(folder / SUBMIT, STUB_SQUEUE="1")  # a controller that restarts: they may well be queued
+    assert (code, "squeue does not answer" in said) == (1, True)
     assert stubs.calls("sbatch") == []
+    assert stubs.run(folder / SUBMIT, STUB_QUEUE="99\n1030\n")[0] == 0  # others' jobs, and its own are over
+    assert len(stubs.calls("sbatch")) == 4
 
 
 def test_what_slurm_knows_is_asked_once(stubs: Stubs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ import typer
 
 from space_dist.cli.overview import display, print_cells, print_failures, status_json, summary, tell, workers_in_words
 from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one_of, output_left, say, warn
-from space_dist.errors import ConfigError, LedgerError, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile
 
@@ -70,6 +70,7 @@ Seed = Annotated[int, typer.Option(help="The run's seed.")]
 
 _MODES = ("auto", "pool", "jobs")
 _WATCH_SECONDS = 1.0
+_MAX_DIGITS = 9  # of a number that is asked for
 _UNFINISHED = 3  # the exit code of `grid status` where runs are still to be done
 
 
@@ -157,8 +158,11 @@ def grid_run(
             place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part, warm=warm
         )  # fmt: skip
     codes.append(tell(manifest, place, found))
-    for place, manifest in others:
+    for number, (place, manifest) in enumerate(others):
         if STOP.reason() is not None:
+            waiting = ", ".join(later.name for _, later in others[number:])
+            warn(f"stopped before {waiting}: run the same command again to go on")
+            codes.append(Interrupted.exit_code)
             break
         found = run_frozen(place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes)
         codes.append(tell(manifest, place, found))
@@ -450,8 +454,8 @@ def mode_of(text: str) -> Mode:
 
 
 def _number(text: str, option: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
-        raise ConfigError(f"{option} {text!r}: write auto, or a whole number from 1 to 10000")
+    if not text.isdecimal() or len(text) > _MAX_DIGITS or not 1 <= int(text) <= 10_000:
+        raise ConfigError(f"{option} {text[:40]!r}: write auto, or a whole number from 1 to 10000")
     return int(text)
 
 
@@ -459,8 +463,9 @@ def _part(runs: Sequence[Run], part: str | None) -> Sequence[Run]:
     if part is None:
         return runs
     first, dash, last = part.partition("-")
-    if not (dash and first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
-        raise ConfigError(f"--part {part!r}: write FIRST-LAST, like 0-3")
+    numbers = dash and first.isdecimal() and last.isdecimal() and max(len(first), len(last)) <= _MAX_DIGITS
+    if not numbers or int(first) > int(last):
+        raise ConfigError(f"--part {part[:40]!r}: write FIRST-LAST, like 0-3")
     if int(first) >= len(runs):
         raise ConfigError(f"--part {part}: the grid has {len(runs)} runs, counted from 0")
     return runs[int(first) : int(last) + 1]

@@ -237,13 +237,13 @@ def print_report(result: Report, to: Console) -> None:
         for row in result.table:
             table.add_row(*(text.replace("[", r"\[") for text in row.values()))
     else:
-        table = Table("", *(row["configuration"] for row in result.table))
+        table = Table("", *(row["configuration"].replace("[", r"\[") for row in result.table))
         for column in list(result.table[0])[1:]:
             table.add_row(column, *(row[column].replace("[", r"\[") for row in result.table))
     to.print(table)
     for remark in result.remarks:
         to.print(remark, highlight=False, markup=False)
-    to.print(f"Figure and tables: {result.figure.parent}", highlight=False, soft_wrap=True)
+    to.print(f"Figure and tables: {result.figure.parent}", highlight=False, markup=False, soft_wrap=True)
 
 
 def print_grid_report(result: GridReport, to: Console) -> None:

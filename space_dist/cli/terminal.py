@@ -74,7 +74,8 @@ def keep_outputs() -> None:
             at_once: bool = stream.write_through  # PYTHONUNBUFFERED
             setattr(sys, name, io.TextIOWrapper(
                 output if at_once else io.BufferedWriter(output),  # as Python itself does
-                encoding=stream.encoding, errors=stream.errors,
+                encoding=stream.encoding,
+                errors="replace" if stream.errors == "strict" else stream.errors,  # a terminal may lack some characters
                 line_buffering=number == 2 or output.isatty(), write_through=at_once,
             ))  # fmt: skip
 

@@ -144,7 +144,11 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
     options: list[type[BaseModel]] = []
     # What each item of a list, or of a user's own names, stands for, where the next part is one.
     named: type[BaseModel] | None = None
+    alternative = False  # whether the next part names the one that a value was taken for
     for part in location:
+        if alternative:
+            alternative = False
+            continue
         if named is not None:
             path.append(str(part))
             model, named = named, None
@@ -160,6 +164,7 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
         inner = _models(field) if field else []
         if field is not None and part != location[-1]:
             model = inner[0] if len(inner) == 1 else None
+            alternative = model is not None and len(_annotations(field).keys() - {types.NoneType}) > 1
             options = inner if len(inner) > 1 else []
             named = next(iter(_items(field)), None) or _by_name(field)
     return path, model
@@ -180,11 +185,14 @@ def _by_name(field: Any) -> type[BaseModel] | None:
 
 
 def _models(field: Any) -> list[type[BaseModel]]:
-    annotations = (
-        get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else [field.annotation]
-    )
-    return [annotation for annotation in annotations
-            if isinstance(annotation, type) and issubclass(annotation, BaseModel)]  # fmt: skip
+    return [one for one in _annotations(field) if isinstance(one, type) and issubclass(one, BaseModel)]
+
+
+def _annotations(field: Any) -> dict[Any, None]:
+    """What a field may be, in order."""
+    union = get_origin(field.annotation) in (Union, types.UnionType)
+    alternatives = get_args(field.annotation) if union else [field.annotation]
+    return {get_args(one)[0] if get_origin(one) is Annotated else one: None for one in alternatives}
 
 
 def _key(name: str, field: Any) -> str:

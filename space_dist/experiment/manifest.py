@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from space_dist import config as configs
 from space_dist.config import NAME, Mirrors, Patience, ResourcesConfig, RunConfig, Section
@@ -29,11 +29,12 @@ from space_dist.errors import ConfigError, LedgerError, NotPlannedError, nearest
 from space_dist.experiment import scaling
 from space_dist.experiment.search import Search
 from space_dist.ledger import Ledger, owner_alive
-from space_dist.system.files import atomic_write
+from space_dist.system.files import atomic_write, read_file
 
 FORMAT = 1
 MANIFEST = "manifest.json"
 CELL_ID_DIGITS = 12  # 48 bits: among 10,000 cells two are alike once in five million grids, and are refused
+MAX_SEED = 2**31 - 1
 MAX_RUNS = 100_000  # a folder each; a typing error in a range makes millions
 _MAX_MANIFEST_BYTES = 512 << 20
 _MAX_LABEL = 120  # characters; what is cut is told apart by the id
@@ -52,10 +53,36 @@ _NOT_OF_A_GRID = {
 class SeedRange(Section):
     """Consecutive seeds."""
 
-    start: int = Field(default=0, ge=0, le=2**31 - 1)
+    start: int = Field(default=0, ge=0, le=MAX_SEED)
     """The first seed."""
     count: int = Field(ge=1, le=MAX_RUNS)
     """How many seeds."""
+
+    @model_validator(mode="after")
+    def _check(self) -> SeedRange:
+        if self.start + self.count - 1 > MAX_SEED:
+            raise ValueError(
+                f"the last seed would be {self.start + self.count - 1}; the largest there is is {MAX_SEED}"
+            )
+        return self
+
+
+def _listed_or_range(given: Any) -> Any:
+    if not isinstance(given, list | tuple | Mapping | SeedRange):
+        raise ValueError("write a list, like [0, 1, 2], or a range, like {start: 0, count: 10}")
+    return given
+
+
+def _seeds_are(given: Any) -> str:
+    return "range" if isinstance(given, Mapping | SeedRange) else "list"
+
+
+_SeedList = Annotated[tuple[Annotated[int, Field(ge=0, le=MAX_SEED)], ...], Field(strict=False)]
+Seeds = Annotated[
+    Annotated[_SeedList, Tag("list")] | Annotated[SeedRange, Tag("range")],
+    Discriminator(_seeds_are),
+    BeforeValidator(_listed_or_range),
+]
 
 
 class RunResources(Patience):
@@ -113,7 +140,7 @@ class GridConfig(Section):
     """Axes of equal length that go together: first values with first values, and so on."""
     exclude: tuple[dict[str, Any], ...] = Field(default=(), strict=False)
     """Cells to leave out: all those that have every key and value of an entry."""
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0, le=2**31 - 1)], ...], Field(strict=False)] | SeedRange
+    seeds: Seeds
     """Every cell runs with each: a list, or start and count."""
     resources: RunResources = RunResources()
     retry: Retry = Retry()
@@ -239,9 +266,13 @@ def load_grid(
 
 
 def _refuse_changes(grid: GridConfig, changes: Sequence[str]) -> None:
-    """Raise ConfigError for changes of what cells differ in, and of what is the grid's own."""
+    """Raise ConfigError for changes of what cells differ in, of what is the grid's own, and of one thing twice."""
+    keys: list[str] = []
     for change in changes:
         key = change.partition("=")[0].strip()
+        if twice := [other for other in keys if f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")]:
+            raise ConfigError(f"{configs.told(change)}: {twice[0]} is changed already; change everything once")
+        keys.append(key)
         head = key.partition(".")[0]
         if head in _NOT_OF_A_GRID:
             own = _NOT_OF_A_GRID[head]
@@ -491,8 +522,7 @@ class Grid:
     def manifest(self) -> Manifest:
         """The frozen grid. Raises LedgerError if there is none, or it is damaged."""
         try:
-            with self.manifest_file.open("rb") as file:
-                content = file.read(_MAX_MANIFEST_BYTES + 1)
+            content = read_file(self.manifest_file, _MAX_MANIFEST_BYTES + 1)
         except FileNotFoundError:
             raise NotPlannedError(f"{self.folder} holds no grid: it has no {MANIFEST}") from None
         except OSError as error:
@@ -531,7 +561,7 @@ class Grid:
         for name, sha256 in manifest.instances.items():
             path = self.instances / name
             try:
-                files[name] = path.read_bytes()
+                files[name] = read_file(path)
             except OSError as error:
                 raise LedgerError(f"{path} cannot be read: {error.strerror}") from None
             if hashlib.sha256(files[name]).hexdigest() != sha256:

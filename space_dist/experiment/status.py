@@ -20,7 +20,7 @@ from space_dist.errors import LedgerError
 from space_dist.experiment.endings import Busy, Cause, Ended, Evidence, why_ended
 from space_dist.experiment.manifest import Grid, Manifest, Retry, Run
 from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, process_of, this_process
-from space_dist.system.files import in_words, open_own
+from space_dist.system.files import in_words, open_own, read_file
 
 ATTEMPTS = "attempts.jsonl"
 MAX_DETAIL = 4000  # characters
@@ -94,8 +94,7 @@ class Attempts:
     def rows(self) -> list[Row]:
         """Every intact row."""
         try:
-            with self.path.open("rb") as file:
-                content = file.read(_MAX_BYTES)
+            content = read_file(self.path, _MAX_BYTES)
         except (FileNotFoundError, NotADirectoryError):
             return []
         except OSError as error:
@@ -275,7 +274,7 @@ def exit_code(found: Sequence[RunStatus]) -> int:
 def last_lines(path: Path, count: int = 5, limit: int = 64 << 10) -> list[str]:
     """The last lines of a text file that may be long, missing, or no text at all."""
     try:
-        with path.open("rb") as file:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe would have us wait
             size = file.seek(0, os.SEEK_END)
             file.seek(max(0, size - limit))
             text = file.read(limit).decode(errors="replace")

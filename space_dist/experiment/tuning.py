@@ -18,7 +18,7 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, Section
 from space_dist.errors import ConfigError, NotPlannedError, nearest
-from space_dist.experiment.manifest import MANIFEST, MAX_RUNS, Grid, GridTracking, Retry, RunResources, SeedRange
+from space_dist.experiment.manifest import MANIFEST, MAX_RUNS, Grid, GridTracking, Retry, RunResources, SeedRange, Seeds
 
 MAX_TRIALS = 10_000  # of an arm
 _MAX_CHOICES = 1000
@@ -37,8 +37,6 @@ _SAME_FOR_ALL = {  # what must not differ between trials, and why
     "checkpoint": "it decides no result",
 }
 _FOR_ALL_AT_ONCE = ("instances", "budget", "evaluation", "env.id", "env.kwargs", "init_from", "checkpoint")
-
-Seeds = Annotated[tuple[Annotated[int, Field(ge=0, le=2**31 - 1)], ...], Field(strict=False)] | SeedRange
 
 
 class Distribution(Section):

@@ -348,11 +348,12 @@ def _child_main(work: Callable[[Tell], None], output: Path, pipe: int) -> int:
         if os.getpid() != own:  # a copy that the run's environment has forked
             return
         said = Said.of(error)
-        if error is not None:
-            print(f"space-dist: {error}", file=sys.stderr)
         codes.append(said.code)
         row = {"run": run.key, **dataclasses.asdict(said), "message": said.message[:_MOST_WORDS]}
         os.write(pipe, json.dumps(row).encode() + b"\n")
+        if error is not None:
+            with contextlib.suppress(OSError):  # the disk of its output may be full
+                print(f"space-dist: {error}", file=sys.stderr)
 
     work(tell)
     return codes[0] if len(codes) == 1 else 0

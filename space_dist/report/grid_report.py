@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -59,12 +60,13 @@ from space_dist.report.tables import (
     steps_text,
     to_csv,
 )
-from space_dist.system.files import atomic_write
+from space_dist.system.files import atomic_write, read_file
 
 MAX_DRAWN: Final = 48  # cells with a learning curve
 MAX_LISTED: Final = 100  # failures, remarks
 MAX_ANALYSED: Final = 48  # cells whose instances and curricula are looked at one by one
 _CURVES_PER_PANEL: Final = 6
+_MAX_REPORT_BYTES: Final = 16 << 20
 _METHOD: Final = tuple(
     " ".join(paragraph.split())
     for paragraph in f"""
@@ -150,7 +152,7 @@ def build_grid_report(
         Section("", summary),
         Section("Final return on the held-out instances", rows=finals),
         *_failed(cells),
-        *_curves(cells, reference, note),
+        *_curves(cells, compared, note),
     ]
     if any(cell.summary.n_finished for cell in cells):
         names = [_name(*pair) for pair in zip(cells, compared, strict=True)]
@@ -169,24 +171,25 @@ def build_grid_report(
     sections += [Section("Remarks", items=remarks)] if remarks else []
     document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
     markdown = to_markdown(document)
+    more = {
+        "curves.csv": _curve_rows(cells),
+        "seeds.csv": _seed_rows(cells),
+        "inclusion.csv": inclusion_rows(curricula),
+        "curricula.csv": curriculum_rows(curricula),
+        "agreement.csv": agreement_rows(curricula),
+        "forgetting.csv": forgetting_rows(analysed),
+    }
     files = {
         **{picture.file: picture.png for section in document.sections for picture in section.pictures},
         "cells.csv": to_csv([_numbers(*three) for three in zip(cells, compared, measures, strict=True)]).encode(),
-        **_more_csv(
-            {
-                "curves.csv": _curve_rows(cells),
-                "seeds.csv": _seed_rows(cells),
-                "inclusion.csv": inclusion_rows(curricula),
-                "curricula.csv": curriculum_rows(curricula),
-                "agreement.csv": agreement_rows(curricula),
-                "forgetting.csv": forgetting_rows(analysed),
-            }
-        ),
+        **{name: to_csv(rows).encode() for name, rows in more.items() if rows},
         "runs.csv": to_csv(_run_numbers(grid, cells)).encode(),
         "report.md": markdown.encode(),
         "report.html": to_html(document).encode(),
     }
     with writing_to(folder):
+        for name in {*_pictures_of(folder / "report.md"), *more} - {*files}:  # of the report before, on other runs
+            (folder / name).unlink(missing_ok=True)
         for name, content in files.items():
             atomic_write(folder / name, content)
     table = [
@@ -195,9 +198,13 @@ def build_grid_report(
     return GridReport(folder, summary, table, remarks, markdown)
 
 
-def _more_csv(tables: Mapping[str, list[dict[str, Value]]]) -> dict[str, bytes]:
-    """Those that have rows."""
-    return {name: to_csv(rows).encode() for name, rows in tables.items() if rows}
+def _pictures_of(report: Path) -> list[str]:
+    """The files that an earlier report shows."""
+    try:
+        content = read_file(report, _MAX_REPORT_BYTES)
+    except OSError:
+        return []
+    return [name.decode() for name in re.findall(rb"\]\((\w+\.png)\)", content)]
 
 
 # ---- sentences ------------------------------------------------------------------------------------------------------
@@ -385,22 +392,29 @@ def _pooled(cells: Sequence[CellRuns]) -> list[Section]:
 # ---- figures --------------------------------------------------------------------------------------------------------
 
 
-def _curves(cells: Sequence[CellRuns], baseline: CellRuns, note: str) -> list[Section]:
-    drawn = [cell for cell in cells if cell.configuration.drawn]
-    text = []
-    if len(drawn) > MAX_DRAWN:
-        text.append(f"Of {len(drawn):,} cells, the {MAX_DRAWN} of the highest final IQM are drawn, best first, and the "
-                    "baseline.")  # fmt: skip
-        drawn = sorted(drawn, key=_descending)[:MAX_DRAWN]
-    if not drawn:
-        return []
-    if len(drawn) <= len(COLOURS):
-        figure = draw_comparison([cell.configuration for cell in drawn])
-        caption = "Test return, train return and size of the training set over environment steps"
-    else:
-        figure = draw_panels(_panels(drawn, baseline))
-        caption = "Test return over environment steps (IQM over seeds, 95 % interval); grey: the baseline"
-    return [Section("Learning curves", text, pictures=[Picture("curves.png", caption, png(figure, note))])]
+def _curves(cells: Sequence[CellRuns], compared: Sequence[Comparison], note: str) -> list[Section]:
+    """One figure a task: returns of different tasks have no common scale."""
+    references = {cell.task: comparison.reference for cell, comparison in zip(cells, compared, strict=True)}
+    several, text, pictures = len(references) > 1, [], []
+    for number, (task, reference) in enumerate(references.items(), start=1):
+        own = [cell for cell in cells if cell.task == task and cell.configuration.drawn]
+        if not own:
+            continue
+        which = f": environment and test set of {own[0].label}" if several else ""
+        if len(own) > MAX_DRAWN:
+            text.append(f"Of {len(own):,} cells, the {MAX_DRAWN} of the highest final IQM are drawn, best first, "
+                        f"and the baseline{which}.")  # fmt: skip
+            own = sorted(own, key=_descending)[:MAX_DRAWN]
+        if len(own) <= len(COLOURS):
+            figure = draw_comparison([cell.configuration for cell in own])
+            caption = "Test return, train return and size of the training set over environment steps"
+        else:
+            figure = draw_panels(_panels(own, reference))
+            grey = "" if reference is None else "; grey: the baseline"
+            caption = f"Test return over environment steps (IQM over seeds, 95 % interval){grey}"
+        file = f"curves_{number}.png" if several else "curves.png"
+        pictures.append(Picture(file, f"{caption}{which}", png(figure, note)))
+    return [Section("Learning curves", text, pictures=pictures)] if pictures else []
 
 
 def _descending(cell: CellRuns) -> float:
@@ -408,8 +422,8 @@ def _descending(cell: CellRuns) -> float:
     return math.inf if math.isnan(value) else -value
 
 
-def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
-    """Cells that differ only by the grid's last setting in one panel, where that is few enough; else six and six."""
+def _panels(cells: Sequence[CellRuns], baseline: CellRuns | None) -> list[Panel]:
+    """One task's cells that differ only by the last setting in one panel where that is few enough; else six in each."""
     keys = varying(cells)
     groups = grouped(cells, keys[:-1])
     if max(map(len, groups.values())) > _CURVES_PER_PANEL or len(groups) * 2.5 > len(cells):
@@ -419,9 +433,8 @@ def _panels(cells: Sequence[CellRuns], baseline: CellRuns) -> list[Panel]:
     def curves(group: Sequence[CellRuns]) -> list[Configuration]:
         return [cell.configuration for cell in group if cell is not baseline]
 
-    reference = baseline.configuration if baseline.configuration.drawn else None
-    return [Panel(", ".join(place), curves(group), reference if group[0].task == baseline.task else None)
-            for place, group in groups.items() if curves(group)]  # fmt: skip
+    reference = None if baseline is None or not baseline.configuration.drawn else baseline.configuration
+    return [Panel(", ".join(place), curves(group), reference) for place, group in groups.items() if curves(group)]
 
 
 def _maps(cells: Sequence[CellRuns], note: str) -> list[Section]:

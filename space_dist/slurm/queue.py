@@ -13,6 +13,7 @@ from typing import Any
 
 from space_dist.config import clean
 from space_dist.slurm.export import JOBS
+from space_dist.system.files import read_file
 
 _AGAIN_SECONDS = 30.0  # between two questions to SLURM: a controller serves everybody
 _SECONDS = 20.0  # for squeue and sacct, whose controller may be busy or gone
@@ -79,7 +80,7 @@ class WatchedQueue:
 
 def _jobs(folder: Path) -> dict[str, tuple[str, ...]]:
     try:
-        text = (folder / JOBS).read_text()[:_MAX_BYTES]
+        text = read_file(folder / JOBS, _MAX_BYTES).decode()
     except (OSError, UnicodeDecodeError):
         return {}
     jobs: dict[str, tuple[str, ...]] = {}

@@ -134,3 +134,6 @@ class LogFile(logging.FileHandler):
     def _open(self) -> io.TextIOWrapper:
         descriptor = open_own(Path(self.baseFilename), os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         return io.TextIOWrapper(io.BufferedWriter(io.FileIO(descriptor, "a")), encoding="utf-8")
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Nothing: what cannot be logged ends nothing; on a full disk, whoever cannot write what matters says so."""

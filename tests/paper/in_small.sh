@@ -17,8 +17,11 @@ if [ $# -eq 0 ]; then
 fi
 for name in "$@"; do
   .venv/bin/python jobs/results.py "$name" --scale "$scale" --root "$made/runs" --out "$made/results"
-  for file in report.md cells.csv seeds.csv curves.png provenance.json; do
+  for file in report.md cells.csv seeds.csv provenance.json; do
     test -s "$made/results/$name-scale-$scale/$file" || { echo "in_small: $name has no $file" >&2; exit 1; }
+  done
+  for file in "$made/results/$name-scale-$scale"/curves*.png; do # one a task
+    test -s "$file" || { echo "in_small: $name has no learning curves" >&2; exit 1; }
   done
   grep -q "A grid in small, scale $scale" "$made/results/$name-scale-$scale/report.md" || {
     echo "in_small: $name does not say that it is in small" >&2

@@ -15,7 +15,8 @@ jobs=$grid/slurm_jobs.txt
 mkdir -p -- "$grid" logs
 
 if [ -s "$jobs" ]; then
-  queued=$(squeue --noheader --format=%F --jobs="$(cut -d' ' -f1 "$jobs" | paste -sd,)" 2>/dev/null | sort -u | paste -sd' ') || queued=''
+  listed=$(squeue --noheader --format=%F) || quit 1 "squeue does not answer, so nobody knows whether this is in the queue already; try again"
+  queued=$(cut -d' ' -f1 "$jobs" | grep -Fxf - <(sort -u <<<"$listed") | paste -sd' ') || queued=''
   if [ -n "$queued" ]; then
     echo "already in the queue, nothing to do: $queued (scancel ends them, then submit again)"
     exit 0
