@@ -12,7 +12,7 @@ from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,9 +93,11 @@ class InstanceSet:
     columns: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if isinstance(self.names, str) or not all(isinstance(name, str) for name in (*self.names, *self.columns)):
+            raise ConfigError(f"names of features are a tuple of words, not {self.names!r}")
+        object.__setattr__(self, "names", tuple(self.names))
         _check_names((*self.names, *self.columns))
-        given = np.asarray(self.ids)
-        contexts = np.asarray(self.contexts, dtype=np.float64)
+        given, contexts = np.asarray(self.ids), _numbers("the contexts", self.contexts)
         if contexts.ndim != 2 or given.shape != contexts.shape[:1] or contexts.shape[1] != len(self.names):
             raise ConfigError(
                 f"ids of shape {given.shape}, contexts of shape {contexts.shape} and {len(self.names)} "
@@ -119,7 +121,7 @@ class InstanceSet:
             raise ConfigError(f"two instances have the id {ids[repeated[0]]}")
         # + 0.0 turns -0.0 into 0.0: equal contexts shall have equal bytes, and so equal digests
         _freeze(self, ids=ids, contexts=contexts[order] + 0.0)
-        columns = {name: np.asarray(values, dtype=np.float64) for name, values in self.columns.items()}
+        columns = {name: _numbers(f"the column {shown(name)}", values) for name, values in self.columns.items()}
         for name, values in columns.items():
             if values.shape != given.shape or not np.isfinite(values).all():
                 raise ConfigError(f"the column {shown(name)} must hold one finite number for each instance")
@@ -460,6 +462,13 @@ def repeats(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.in
     earlier, later = order[equal], order[equal + 1]
     by_later = np.argsort(later)
     return earlier[by_later], later[by_later]
+
+
+def _numbers(what: str, given: Any) -> NDArray[np.float64]:
+    try:
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{what} must be numbers, as many in each row") from None
 
 
 def _check_names(names: tuple[str, ...]) -> None:

@@ -164,6 +164,31 @@ class UsesGlobalGenerator(Honest):
         return super().move(action) + np.random.uniform(0.0, 0.1)  # noqa: NPY002
 
 
+class Exits(Honest):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:  # noqa: ARG002
+        raise SystemExit(0)
+
+
+class EndsInArrays(Honest):
+    def step(self, action: Any) -> tuple[Any, float, Any, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, np.array([terminated, terminated]), truncated, info
+
+
+class FromOne(Honest):
+    action_space: Any = spaces.Discrete(3, start=1)
+
+
+class TwoChoices(Honest):
+    action_space: Any = spaces.MultiDiscrete([2, 3])
+
+
+class AnyHorizon(Honest):
+    """Its episodes end by themselves, after a dozen steps."""
+
+    horizon: Any = 2**62
+
+
 class WrongShape(Honest):
     def observe(self) -> Any:
         return np.zeros(2, dtype=np.float32)

@@ -317,6 +317,18 @@ def test_a_round_longer_than_the_grace_time_ends_on_the_last_checkpoint(finished
 # ---- what comes after a run ----
 
 
+def test_evaluate_writes_over_nothing_that_it_reads(
+    capsys: pytest.CaptureFixture[str], finished: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "test.csv"
+    own.write_bytes(Path(TEST).read_bytes())
+    for out, said in ((own, "is the file of the instances"), (finished / METRICS, "lies in the run's own folder")):
+        before = out.read_bytes()
+        code, _, error = run(capsys, "evaluate", finished, "--instances", own, "--out", out)
+        assert (code, said in " ".join(error.split())) == (2, True)
+        assert out.read_bytes() == before
+
+
 def test_evaluate_gives_what_the_final_evaluation_of_a_policy_could_give(
     capsys: pytest.CaptureFixture[str], finished: Path, tmp_path: Path
 ) -> None:

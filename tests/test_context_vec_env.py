@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -136,6 +137,14 @@ def test_probe_episodes_are_counted() -> None:
 # ---- what is refused ----
 
 
+def test_numpys_numbers_are_numbers_and_a_copy_is_another() -> None:
+    env = ContextVecEnv(Honest, CONTEXTS, np.int64(2), seed=np.int64(3))
+    other = copy.deepcopy(env)
+    assert (env.num_envs, env.run_seed, type(env.run_seed)) == (2, 3, int)
+    for _ in range(3):
+        np.testing.assert_array_equal(env.reset(), other.reset())
+
+
 @pytest.mark.parametrize(
     ("attempt", "sentence"),
     [
@@ -147,6 +156,9 @@ def test_probe_episodes_are_counted() -> None:
         (lambda: CurriculumCallback().selection, r"before learn\(\) has begun"),
         (lambda: ContextVecEnv(Honest(), CONTEXTS), "env is a Honest; give the class"),
         (lambda: ContextVecEnv(Honest, CONTEXTS, 0), "n_envs must be a whole number of at least 1, not 0"),
+        *((lambda seed=seed: ContextVecEnv(Honest, CONTEXTS, seed=seed), "seed must be a whole number of at least 0")
+          for seed in (-1, None, 1.5, True)),
+        (lambda: ContextVecEnv(Honest, CONTEXTS, env_kwargs=3), "env_kwargs must be a dict, not 3"),  # type: ignore[arg-type]
         (lambda: ContextVecEnv(Honest, CONTEXTS[:, 0]), r"shape \(3,\); it needs one row an instance and 2 columns, "
                                                         "one for each of gain, drift"),
         (lambda: ContextVecEnv(Honest, [["a", "b"]]), "instances is a list; give a CSV file"),

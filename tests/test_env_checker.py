@@ -39,6 +39,10 @@ FAULTS = {
     "NoInfo": "reset() must return (observation, info)",
     "OldStep": "step() must return (observation, reward, terminated, truncated, info)",
     "FailsAtTheEdge": "reset() with the context gain .* fails: KeyError: 'no such gain'",
+    "Exits": "step() fails: SystemExit",
+    "EndsInArrays": "step() must return terminated and truncated as a truth value each",
+    "FromOne": "actions must be a one-dimensional Box or Discrete from 0, not Discrete(3, start=1)",
+    "TwoChoices": "actions must be a one-dimensional Box or Discrete from 0, not MultiDiscrete",
     "FailsInStep": "step() fails: ZeroDivisionError",
     "ChangesActions": "step() changes the action it is given",
     "NumberObserved": "its observation_space must be a Box or a Dict of Boxes, not Discrete(5)",
@@ -125,6 +129,10 @@ class Long(Honest):
 def test_no_horizon_is_too_long_for_it(horizon: int) -> None:
     findings = check(f"{__name__}:Long", {"horizon": horizon})
     assert (findings.faults, findings.horizon) == ([], horizon)
+
+
+def test_a_horizon_that_is_never_reached_may_be_any_number() -> None:
+    assert check("tests.faulty_env:AnyHorizon").faults == []
 
 
 class OverAtTheEnd(Long):

@@ -100,3 +100,9 @@ def test_what_cannot_be_exported_is_a_sentence(
     (tmp_path / "taken").write_text("a file")
     assert command(monkeypatch, "export-sb3", "run", "--out", "taken/policy.zip") == 2
     assert "taken/policy.zip cannot be written" in capsys.readouterr().err
+    (tmp_path / "folder.zip").mkdir()
+    for folder in ("folder.zip", "folder", ".", "..", ""):
+        assert command(monkeypatch, "export-sb3", "run", "--out", folder) == 2
+        assert "is a folder; name" in " ".join(capsys.readouterr().err.split())
+    assert {path.name for path in tmp_path.iterdir()} >= {"run", "taken", "folder.zip"}
+    assert not [*tmp_path.glob("*zip_*"), *tmp_path.glob("folder.zip/*"), *tmp_path.glob("..*zip")]

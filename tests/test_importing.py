@@ -17,6 +17,7 @@ from gymnasium.envs.classic_control import CartPoleEnv  # noqa: F401 - likewise,
 from space_dist.errors import ConfigError
 from space_dist.system.importing import folders_of_user, load, look_in, why_refused
 from tests.commanding import command
+from tests.grids import ROOT
 from tests.patience import PATIENCE
 
 PROGRAM = Path(sys.executable).parent / "space-dist"
@@ -197,3 +198,18 @@ def test_of_carls_modules_only_environments_are_named(monkeypatch: pytest.Monkey
     assert "Traceback" not in capsys.readouterr().err
     assert command(monkeypatch, "env", "check", "carl.utils.types:Context") == 2
     assert "carl" in capsys.readouterr().err
+
+
+def test_a_script_elsewhere_finds_what_lies_in_the_current_folder(tmp_path: Path) -> None:
+    """Whatever of the package it calls first."""
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "own_world.py").write_text("from tests.faulty_env import Honest\n\n\nclass World(Honest):\n    pass\n")
+    script = tmp_path / "scripts/script.py"
+    script.write_text(
+        "from space_dist.sb3 import ContextVecEnv\nprint(ContextVecEnv('own_world:World', [[0.2, 0.0]]).num_envs)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -406,6 +407,26 @@ def test_bounds_refused(names: tuple[str, ...], low: list[float], high: list[flo
 def test_instance_set_refused(ids: list[int], contexts: list[list[float]], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         InstanceSet(np.array(ids), np.array(contexts), ("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("contexts", "names", "columns", "said"),
+    [
+        ([["x"]], ("a",), {}, "the contexts must be numbers, as many in each row"),
+        ([[1.0], [1.0, 2.0]], ("a",), {}, "the contexts must be numbers, as many in each row"),
+        ([[1.0]], (3,), {}, "names of features are a tuple of words"),
+        ([[1.0]], "a", {}, "names of features are a tuple of words"),
+        ([[1.0]], ("a",), {"level": ["high"]}, "the column 'level' must be numbers"),
+    ],
+)
+def test_what_is_no_number_and_no_word_is_refused(contexts: Any, names: Any, columns: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        InstanceSet(np.arange(len(contexts)), contexts, names, columns)
+
+
+def test_names_may_be_listed() -> None:
+    listed: Any = ["a", "b"]
+    assert InstanceSet(np.array([0]), np.array([[1.0, 2.0]]), listed).names == ("a", "b")
 
 
 def test_instance_set_is_sorted_and_frozen() -> None:

@@ -89,6 +89,11 @@ def evaluate(
 
     ledger = Ledger(run)
     status = ledger.status()
+    if out is not None:
+        if out.resolve() == Path(located(instances)).resolve():
+            raise ConfigError(f"--out {out} is the file of the instances, which would be lost; name another")
+        if out.resolve().is_relative_to(ledger.folder.resolve()):
+            raise ConfigError(f"--out {out} lies in the run's own folder; name a file elsewhere")
     state = "abandoned" if ledger.abandoned(status) else status.state
     config = stored_config(ledger)
     spec = spec_of(config)

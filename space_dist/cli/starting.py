@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from pathlib import Path
 from typing import Annotated, Optional
@@ -67,4 +68,4 @@ def init(
             say(str(target))
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
-    say(f"Next: cd {folder} && space-dist train slider.yaml   (README.md says what else)")
+    say(f"Next: cd {shlex.quote(str(folder))} && space-dist train slider.yaml   (README.md says what else)")

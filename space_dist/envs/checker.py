@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from space_dist.envs import BatchedEnv, BatchedSingles, DrawsContexts, close, distribution_of, make_batched
 from space_dist.envs.generating import EnvironmentGenerator, own_method
-from space_dist.envs.interface import FloatArray, Step
+from space_dist.envs.interface import FloatArray, Step, refuse_actions
 from space_dist.envs.observations import Observations
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
@@ -101,7 +101,11 @@ class _Check:
             self._drawn = instances is None and not isinstance(env, DrawsContexts)
             self._contexts = self._draw() if instances is None else _cycled(instances.contexts, N_CONTEXTS)
             self._seeds = episode_seeds(0, Purpose.EPISODES, count=N_CONTEXTS)
-            self._actions = _sampled_actions(env.action_space, N_CONTEXTS + 1, max(self._horizon, COMPARED_STEPS))
+            try:
+                refuse_actions(env.action_space)
+            except ConfigError as error:
+                raise FaultError(str(error).removeprefix("env.id: ")) from None
+            self._actions = _sampled_actions(env.action_space, N_CONTEXTS + 1, COMPARED_STEPS)
 
     def run(self) -> None:
         with self._single() as single:
@@ -144,6 +148,8 @@ class _Check:
             if not isinstance(told, tuple) or len(told) != 5:
                 raise FaultError("step() must return (observation, reward, terminated, truncated, info)")
             self._refuse_misfits(env.observation_space, _as_batch(told[0]), 1, f"step {time + 1}")
+            if np.ndim(told[2]) or np.ndim(told[3]):
+                raise FaultError("step() must return terminated and truncated as a truth value each, not as arrays")
             if told[2] or told[3]:
                 break
 
@@ -155,7 +161,8 @@ class _Check:
             self._refuse_misfits(env.observation_space, current, n, "reset")
             alive = np.ones(n, dtype=np.bool_)
             for time in range(self._horizon):
-                step = self._step(env, self._actions[:n, time])
+                # Again and again the same, beyond those that are drawn: a horizon may be any number.
+                step = self._step(env, self._actions[:n, time % COMPARED_STEPS])
                 self._refuse_misfits(env.observation_space, step.observations, n, f"step {time + 1}")
                 self._refuse_step(step, n, time + 1)
                 alive &= ~(step.terminated | step.truncated)
@@ -263,7 +270,7 @@ class _Check:
             warnings.simplefilter("always")
             try:
                 check_env(env, skip_render_check=True, skip_close_check=True)  # type: ignore[arg-type]
-            except Exception as error:  # it asserts, and runs somebody else's code
+            except (Exception, SystemExit) as error:  # it asserts, and runs somebody else's code
                 text = " ".join(str(error).split()) or type(error).__name__
                 raise FaultError(f"Gymnasium's own checker refuses it: {text[:300]}") from None
         for warning in told:
@@ -469,6 +476,6 @@ def _as_batch(observation: Any) -> Any:
 def _called(what: str, call: Callable[[], Any]) -> Any:
     try:
         return call()
-    except Exception as error:  # somebody else's code may raise anything
+    except (Exception, SystemExit) as error:  # somebody else's code may raise anything
         text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {error}"
         raise FaultError(f"{what} fails: {text[:300]}") from None

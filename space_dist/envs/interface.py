@@ -13,6 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from space_dist.envs.observations import Observations, alike
+from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
 
 log = logging.getLogger("space_dist")
@@ -224,6 +225,13 @@ class ContextVisible:
         if isinstance(self.observation_space, spaces.Dict):
             return {"observation": observations, "context": context}
         return np.concatenate([observations.astype(np.float32, copy=False), context], axis=1)
+
+
+def refuse_actions(space: spaces.Space[Any]) -> None:
+    """Raise ConfigError for an action space that no learner here has actions for."""
+    flat = isinstance(space, spaces.Box) and len(space.shape) == 1
+    if not flat and not (isinstance(space, spaces.Discrete) and space.start == 0):
+        raise ConfigError(f"env.id: actions must be a one-dimensional Box or Discrete from 0, not {space}")
 
 
 def starts_alike(env: BatchedEnv, contexts: FloatArray) -> bool:

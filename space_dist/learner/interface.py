@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
 from space_dist.config import LearnerConfig
+from space_dist.envs.interface import refuse_actions
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner import custom
 from space_dist.learner.networks import is_mlp, refuse_policy, torch_policy
@@ -392,8 +393,7 @@ def refuse_spaces(config: LearnerConfig, observation_space: spaces.Space[Any], a
     bounded = isinstance(action_space, spaces.Box) and action_space.is_bounded()
     if config.actions == "bounded" and not (continuous and bounded):
         raise ConfigError(f"learner.kind: {kind} needs bounded continuous actions (a flat Box), not {action_space}")
-    if not continuous and not discrete:
-        raise ConfigError(f"env.id: actions must be a one-dimensional Box or Discrete from 0, not {action_space}")
+    refuse_actions(action_space)
 
 
 @contextmanager

@@ -33,6 +33,8 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
     config, checkpoint = stored_config(ledger), ledger.last_checkpoint()
     if checkpoint is None:
         raise LedgerError(f"{ledger.folder} has no policy yet: no checkpoint was written")
+    if not out.name or out.name == ".." or out.is_dir():
+        raise ConfigError(f"{out} is a folder; name the zip to write, like {out / 'policy.zip'}")
     out = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
     spec = spec_of(config)
     written = []
@@ -43,6 +45,8 @@ def export_sb3(ledger: Ledger, out: Path) -> list[tuple[Path, str]]:
             path = out if config.n_policies == 1 else out.with_name(f"{out.stem}_{number}.zip")
             model: Any = learner.model
             model.num_timesteps = int(checkpoint.data["run"]["steps"])
+            if path.is_dir():  # SB3 would take another name
+                raise ConfigError(f"{path} is a folder; name another zip to write")
             model.save(path)
             written.append((path, f"{_importable(config)}.load takes it"))
             if learner.normalises:

@@ -7,6 +7,7 @@ all instances. It keeps the books that `rollout.collect` keeps, so that what a c
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -64,7 +65,8 @@ class ContextVecEnv(VecEnv):
 
     While a `CurriculumCallback` trains on it, the callback chooses the instances. Otherwise episodes walk over all
     instances by id, from the first at every `reset`: so an environment of test instances, given to SB3's
-    `evaluate_policy` with as many episodes as there are instances, has each played once, and the same each time.
+    `evaluate_policy` with as many episodes as there are instances, has each played once, and the same each time. (With
+    `n_envs=1`: of several, `evaluate_policy` counts equally many episodes each, wherever short ones have led the walk.)
 
     An info holds what the environment told, and at the end of an episode `instance` (its id, -1 for a generated
     context), `context` (d,), `episode` as SB3's Monitor tells it, and `is_success` where the environment knows success.
@@ -88,13 +90,16 @@ class ContextVecEnv(VecEnv):
                 f"ContextVecEnv: env is a {type(env).__name__}; give the class, a function that makes one environment "
                 "at each call, or an id"
             )
-        if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
-            raise ConfigError(f"ContextVecEnv: n_envs must be a whole number of at least 1, not {n_envs!r}")
-        self._env, self._kwargs, self.context_visible = env, env_kwargs, context_visible
+        n_envs = _whole(n_envs, "n_envs", 1)
+        try:
+            kwargs = dict(env_kwargs)  # which can be copied
+        except (TypeError, ValueError):
+            raise ConfigError(f"ContextVecEnv: env_kwargs must be a dict, not {env_kwargs!r}") from None
+        self._env, self._kwargs, self.context_visible = env, kwargs, context_visible
         batched = self.make_batched(n_envs)
         self.bounds = batched.context_bounds
         self.instances = _instances(instances, self.bounds, columns)
-        self.run_seed = seed
+        self.run_seed = _whole(seed, "seed", 0)
         self.horizon = batched.horizon
         self._batched, self._stage = batched, Stage(batched)
         super().__init__(n_envs, batched.observation_space, batched.action_space)
@@ -252,7 +257,7 @@ class ContextVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Have `seed` decide the seeds of all episodes to come."""
         if seed is not None:
-            self.run_seed = seed
+            self.run_seed = _whole(seed, "seed", 0)
         return [seed] * self.num_envs
 
     def close(self) -> None:
@@ -293,6 +298,16 @@ class ContextVecEnv(VecEnv):
         """The single environments, or the batched one as often as it is asked for."""
         env = unwrapped(self._batched)
         return [env.single(slot) if isinstance(env, BatchedSingles) else env for slot in self._get_indices(indices)]
+
+
+def _whole(given: Any, name: str, least: int) -> int:
+    try:
+        number = -1 if isinstance(given, bool) else operator.index(given)
+    except TypeError:
+        number = -1
+    if number < least:
+        raise ConfigError(f"ContextVecEnv: {name} must be a whole number of at least {least}, not {given!r}")
+    return number
 
 
 def _instances(

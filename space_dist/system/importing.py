@@ -58,6 +58,7 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
     """
     module, _, name = import_path.partition(":")
     where = f"{key} {import_path!r}"
+    look_here_too()
     if (reason := why_refused(import_path)) is not None:
         raise ConfigError(f"{where}: {reason}")
     try:
