@@ -74,8 +74,7 @@ def _keep(name: str, path: Path, scale: float, root: Path, out: Path) -> int:
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
     for made in sorted(report.folder.iterdir()):
-        shown = made.suffix == ".png" and f"({made.name})" in report.markdown  # others may be of an earlier report
-        if made.name in KEPT or shown:
+        if made.name in KEPT or made.suffix == ".png":
             shutil.copyfile(made, folder / made.name)
     told = f"make results NAME={name}" + ("" if scale == 1.0 else f" SCALE={scale:g}")
     atomic_write(folder / "provenance.json", json.dumps(_provenance(told, grid, manifest), indent=1).encode() + b"\n")

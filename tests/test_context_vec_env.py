@@ -134,15 +134,15 @@ def test_probe_episodes_are_counted() -> None:
     assert model.num_timesteps <= 1000 + 10 * SLOTS
 
 
-# ---- what is refused ----
-
-
 def test_numpys_numbers_are_numbers_and_a_copy_is_another() -> None:
     env = ContextVecEnv(Honest, CONTEXTS, np.int64(2), seed=np.int64(3))
     other = copy.deepcopy(env)
     assert (env.num_envs, env.run_seed, type(env.run_seed)) == (2, 3, int)
     for _ in range(3):
         np.testing.assert_array_equal(env.reset(), other.reset())
+
+
+# ---- what is refused ----
 
 
 @pytest.mark.parametrize(

@@ -306,6 +306,9 @@ def test_a_report_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:
     build_grid_report(grid)
     left = {path.name for path in report.folder.iterdir()}
     assert left == {"mine.png", "cells.csv", "runs.csv", "report.md", "report.html"}
+    (report.folder / "report.md").write_text("# My own\n\n![of mine](mine.png)\n")
+    build_grid_report(grid)
+    assert (report.folder / "mine.png").exists()
 
 
 def test_a_run_that_cannot_be_read_is_a_failed_one(tmp_path: Path) -> None:

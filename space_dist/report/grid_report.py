@@ -67,6 +67,7 @@ MAX_LISTED: Final = 100  # failures, remarks
 MAX_ANALYSED: Final = 48  # cells whose instances and curricula are looked at one by one
 _CURVES_PER_PANEL: Final = 6
 _MAX_REPORT_BYTES: Final = 16 << 20
+_TITLE: Final = "Grid"
 _METHOD: Final = tuple(
     " ".join(paragraph.split())
     for paragraph in f"""
@@ -169,7 +170,7 @@ def build_grid_report(
             *released_section(analysed, note),
         ]
     sections += [Section("Remarks", items=remarks)] if remarks else []
-    document = Document(f"Grid {manifest.name}", [*sections, Section("How to read this", _METHOD)])
+    document = Document(f"{_TITLE} {manifest.name}", [*sections, Section("How to read this", _METHOD)])
     markdown = to_markdown(document)
     more = {
         "curves.csv": _curve_rows(cells),
@@ -199,10 +200,12 @@ def build_grid_report(
 
 
 def _pictures_of(report: Path) -> list[str]:
-    """The files that an earlier report shows."""
+    """The files that an earlier report of a grid shows; none of a file that is somebody else's."""
     try:
         content = read_file(report, _MAX_REPORT_BYTES)
     except OSError:
+        return []
+    if not content.startswith(f"# {_TITLE} ".encode()):
         return []
     return [name.decode() for name in re.findall(rb"\]\((\w+\.png)\)", content)]
 
