@@ -33,7 +33,7 @@ from space_dist.curricula import Selection
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet
 from space_dist.learner import SB3Learner
-from space_dist.ledger import Checkpoint, decode_checkpoint
+from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Outcomes, Shard
 from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Decision, Evidence, Handle, InProcess
@@ -319,6 +319,102 @@ def test_sb3s_own_checkpoints_hold_the_curriculum_wherever_they_were_made(
         same_selection(again.selection, callback.selection)
 
 
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [("ppo", SPACE), ("a2c", SPACE), ("trpo", SPACE), ("ppo", {"kind": "plr"}), ("ppo", {"kind": "vds"})],
+)
+def test_rounds_of_several_rollouts_go_on_from_wherever_they_were_saved(
+    kind: str, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    """What was learnt from in the round is played again; what was collected since, collected again."""
+    total, asked = 480, {**settings, "round_steps": 120}
+    alone, callback = made(kind), CurriculumCallback(**asked)
+    alone.learn(total, callback=[callback, CheckpointCallback(13, str(tmp_path), name_prefix="m")])
+    rollout = alone.n_steps * SLOTS
+    saved, seen = sorted(tmp_path.glob("m_*.zip")), set()
+    for file in saved:
+        model = MODELS[kind][0].load(file, env=line_env(), device="cpu")
+        seen.add(model.num_timesteps % 120 // rollout)
+        again = CurriculumCallback(**asked)
+        model.learn(total - model.num_timesteps, callback=again, reset_num_timesteps=False)
+        same_models(model, alone)
+        same_selection(again.selection, callback.selection)
+    assert len(saved) == 9
+    assert len(seen) > 2  # in whichever rollout of a round
+
+
+class Cut(BaseCallback):
+    """Ends `learn` in the midst of a rollout."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self._steps = steps
+
+    def _on_step(self) -> bool:
+        return self.n_calls < self._steps
+
+
+@pytest.mark.parametrize("reset", [True, False])
+def test_a_round_whose_later_rollout_is_cut_keeps_what_was_learnt_from(reset: bool) -> None:
+    told: list[int] = []
+
+    class Tell(CurriculumCallback):
+        def _on_rollout_start(self) -> None:
+            super()._on_rollout_start()
+            told.append(self._begun.env.time)
+
+    model, callback = ppo(line_env()), Tell(**SPACE, round_steps=120)
+    model.learn(240, callback=[callback, Cut(25)])
+    assert told == [0, 10, 20]  # steps of each slot
+    told.clear()
+    model.learn(80, callback=callback, reset_num_timesteps=reset)  # two rollouts
+    assert told == [20, 0]
+    assert callback.selection.version == 2  # behind the round, and where learn ended the next one
+
+
+def test_a_round_goes_on_only_where_it_has_the_same_shape_and_plays_the_same(tmp_path: Path) -> None:
+    asked = {**SPACE, "round_steps": 120}
+    ppo(line_env()).learn(240, callback=[CurriculumCallback(**asked), CheckpointCallback(25, str(tmp_path))])
+    (file,) = tmp_path.glob("rl_model_100_*.zip")
+
+    def loaded(n_envs: int = SLOTS, **settings: Any) -> Any:
+        return PPO.load(file, env=line_env(n_envs=n_envs), device="cpu", custom_objects=settings)
+
+    for others in (loaded(n_envs=2), loaded(n_steps=15)):
+        others.learn(1, callback=CurriculumCallback(**asked), reset_num_timesteps=False)
+        assert remembered(others).round == 2  # the next one; the one it was in is not played a second time
+    liar = loaded()
+    checkpoint = remembered(liar)
+    checkpoint.arrays["learnt/rewards"][3, 1] += 1e-9
+    setattr(liar, STATE, base64.b64encode(encode_checkpoint(checkpoint)).decode())
+    with pytest.raises(SpaceDistError, match=r"breaks its word: .* earned .* in a step, and had earned"):
+        liar.learn(1, callback=CurriculumCallback(**asked), reset_num_timesteps=False)
+    for name, bad in (
+        ("learnt/rewards", np.zeros((20, 3))), ("learnt/actions", np.zeros((20, SLOTS, 2))),
+        ("learnt/actions", np.zeros((20, SLOTS, 1), dtype=np.complex64)),
+    ):  # fmt: skip
+        damaged, checkpoint = loaded(), remembered(liar)
+        checkpoint.arrays[name] = bad
+        setattr(damaged, STATE, base64.b64encode(encode_checkpoint(checkpoint)).decode())
+        with pytest.raises(SpaceDistError, match="cannot be read"):
+            damaged.learn(1, callback=CurriculumCallback(**asked), reset_num_timesteps=False)
+
+
+def test_a_model_saved_behind_an_update_does_not_learn_from_its_rollout_twice(tmp_path: Path) -> None:
+    class Save(BaseCallback):
+        def _on_rollout_start(self) -> None:
+            self.model.save(tmp_path / f"m{self.num_timesteps}")
+
+        def _on_step(self) -> bool:
+            return True
+
+    ppo(line_env()).learn(120, callback=[Save(), CurriculumCallback(**SPACE)])
+    model = PPO.load(tmp_path / "m80", env=line_env(), device="cpu")
+    assert remembered(model).data["run"]["steps"] == 40  # what was remembered when the rollout before began
+    model.learn(1, callback=CurriculumCallback(**SPACE), reset_num_timesteps=False)
+    assert model.num_timesteps == 120
+
+
 def test_an_off_policy_model_saved_in_the_midst_goes_on_with_its_curriculum(tmp_path: Path) -> None:
     callback = CurriculumCallback(**SPACE, round_steps=40)
     model = made("dqn")
@@ -352,6 +448,12 @@ def test_what_was_broken_off_is_begun_again(settings: dict[str, Any]) -> None:
     model.learn(40, callback=callback)  # SB3 begins to count anew, and the curriculum goes on
     assert model.num_timesteps == 40
     assert callback.selection.version > version + 1
+
+
+def test_two_curricula_of_one_model_are_refused() -> None:
+    inner = CallbackList([CurriculumCallback("round_robin")])
+    with pytest.raises(ConfigError, match="2 CurriculumCallbacks"):
+        ppo(line_env()).learn(1, callback=[CurriculumCallback("space"), CheckpointCallback(1000, "."), inner])
 
 
 def test_without_gradient_steps_nothing_counts_as_settled() -> None:

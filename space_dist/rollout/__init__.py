@@ -12,7 +12,7 @@ often, it gives the same bits.
 
 from __future__ import annotations
 
-from space_dist.rollout.collecting import Rollout, Shard, Stage, collect, endless, replayed
+from space_dist.rollout.collecting import Rollout, Shard, Stage, another_way, collect, endless, replayed
 from space_dist.rollout.evaluation import Outcomes, Trial, evaluate, joined
 from space_dist.rollout.setup import Setup, Split
 from space_dist.rollout.table import Episodes, EpisodeTable
@@ -21,5 +21,6 @@ from space_dist.rollout.worker import Worker
 
 __all__ = [
     "EpisodeTable", "Episodes", "FloatArray", "IntArray", "Outcomes", "Rollout", "Route", "Setup", "Shard", "Split",
-    "Stage", "Trial", "Unfinished", "Walk", "Walking", "Worker", "collect", "endless", "evaluate", "joined", "replayed",
+    "Stage", "Trial", "Unfinished", "Walk", "Walking", "Worker", "another_way", "collect", "endless", "evaluate",
+    "joined", "replayed",
 ]  # fmt: skip

@@ -254,17 +254,18 @@ def replayed(env: BatchedEnv, table: EpisodeTable) -> Observations:
         ended = np.flatnonzero(step.terminated | step.truncated)
         if len(ended):
             slot = ended[0] if own[ended[0]] else leader
-            raise _another_way(f"ended after {time + 1 - begins[slot]} steps, and had gone on for {lengths[slot]}")
+            raise another_way(f"ended after {time + 1 - begins[slot]} steps, and had gone on for {lengths[slot]}")
     # Equal to the bit or not at all; NaN, as a diverged run's, is equal to itself here.
     differ = np.flatnonzero(table.runs & (returns != table.returns) & ~(np.isnan(returns) & np.isnan(table.returns)))
     if len(differ):
         slot = differ[0]
         earned, before = float(returns[slot]), float(table.returns[slot])
-        raise _another_way(f"earned {earned!r} in {lengths[slot]} steps, and had earned {before!r}")
+        raise another_way(f"earned {earned!r} in {lengths[slot]} steps, and had earned {before!r}")
     return current
 
 
-def _another_way(how: str) -> SpaceDistError:
+def another_way(how: str) -> SpaceDistError:
+    """That an episode, played again, did not go as it had gone, for users."""
     return SpaceDistError(
         "the environment breaks its word: an episode that was played again with the same context, seed and actions "
         f"{how}. Everything random in an episode must come from the seed of its reset, and nothing may be left of "

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from space_dist.config import (
-    check,
-)
+from space_dist.config import check
 from space_dist.curricula import Selection
-from space_dist.errors import SpaceDistError
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.sb3.script import Wrapped
 from space_dist.sb3.session import STATE, Asked, Session
 
@@ -37,8 +35,9 @@ class CurriculumCallback(BaseCallback):
     The environment's seed (SB3's `seed=` of the model sets it) decides everything random in the curriculum. What the
     curriculum tells about itself is logged as `curriculum/...` by the model's own logger.
 
-    Raises ConfigError if kind or settings are wrong; and when `learn` begins, if the model, its environment or its
-    instances cannot give the curriculum what it asks for, or the model remembers another curriculum. Raises
+    Raises ConfigError if kind or settings are wrong; and when `learn` begins, if it was given two of these, the model,
+    its environment or its instances cannot give the curriculum what it asks for, or the model remembers another
+    curriculum. Raises
     SpaceDistError if training diverges, or what the model remembers cannot be read.
     """
 
@@ -81,6 +80,8 @@ class CurriculumCallback(BaseCallback):
         return self._session
 
     def _on_training_start(self) -> None:
+        if (count := _curricula(self.locals.get("callback"))) > 1:
+            raise ConfigError(f"learn was given {count} CurriculumCallbacks, and a model is trained by one curriculum")
         wrapped = Wrapped(self.model.get_env())
         if self._session is None or not self._session.is_of(self.model, wrapped.env):
             self._session = Session(self._asked, self.model, wrapped)
@@ -115,3 +116,9 @@ class CurriculumCallback(BaseCallback):
                 f"curriculum: {self.numbers.get('size')} of {len(session.env.instances)} instances from step "
                 f"{self.model.num_timesteps} on"
             )
+
+
+def _curricula(callback: object) -> int:
+    """How many curricula there are in a callback, and in those that it holds."""
+    held = callback.callbacks if isinstance(callback, CallbackList) else [getattr(callback, "callback", None)]
+    return isinstance(callback, CurriculumCallback) + sum(_curricula(one) for one in held if one is not None)

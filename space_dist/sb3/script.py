@@ -94,7 +94,7 @@ class Wrapped:
         return seen
 
     def put(self, model: BaseAlgorithm, observations: Observations) -> None:
-        """Have `model` go on from (n_envs, ...) raw observations, which begin an episode where `env.starts`."""
+        """Have `model` go on from (n_envs, ...) raw observations, where `env` stands."""
         found: Any = observations
         for wrapper in self._wrappers:
             if isinstance(wrapper, VecNormalize):
@@ -105,7 +105,7 @@ class Wrapped:
             elif isinstance(wrapper, VecTransposeImage):
                 found = wrapper.transpose_observations(found)
         model._last_obs = found
-        model._last_episode_starts = self.env.starts.copy()
+        model._last_episode_starts = self.env.begins
 
 
 class Scored:

@@ -4,9 +4,10 @@ It is `training.Training` without its collecting, learning and bookkeeping, and 
 one rollout of an on-policy model, or rollouts of at least `round_steps` steps; behind its update, the start values of
 all instances are asked for where the selection was passed over once (draws: always), and the curriculum decides.
 
-What there is to remember is written into the model as text, at the beginning of every round and when `learn` returns:
-`model.save` saves it with the model, whoever calls it, and a callback that meets a model with such a text goes on from
-there. The text is a checkpoint as `ledger` encodes them, in base64: arrays and JSON under a hash, and never a pickle.
+What there is to remember is written into the model as text, at the beginning of every round and of every rollout of an
+on-policy model, and when `learn` returns: `model.save` saves it with the model, whoever calls it, and a callback that
+meets a model with such a text goes on from there. The text is a checkpoint as `ledger` encodes them, in base64: arrays
+and JSON under a hash, and never a pickle.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ from space_dist.rollout.policy import Valuing
 from space_dist.rollout.walk import Unfinished, Walk, stacked, unstacked
 from space_dist.run.cluster import CurriculumHost, Evidence
 from space_dist.sb3.script import Scored, Wrapped, gradient_steps, network, refuse_model, weights, with_weights
-from space_dist.sb3.vec_env import ContextVecEnv, RoundPlan
+from space_dist.sb3.vec_env import ContextVecEnv, Played, RoundPlan
 from space_dist.seeding import Purpose, episode_seeds, global_generators, global_seeds
 
 if TYPE_CHECKING:
@@ -107,11 +108,12 @@ class Session:
         self._restored_random: Mapping[str, Any] | None = None  # to go on with, behind the next `begin_round`
         self._open = False  # whether a rollout is being collected
         self._plan: RoundPlan | None = None  # of the round that is played
-        self._sizes_now: list[FloatArray] = []  # what counts of the advantages of this round's rollouts
         self._make()
         self.round = 0
         self.walk = Walk(-1, ())
-        self.sizes: FloatArray | None = None  # (n_envs,) sums of what counts of them over running episodes
+        self.learnt: Played | None = None  # of this round: the on-policy model's rollouts that have ended
+        self.sizes_now: list[FloatArray] = []  # what counts of their advantages
+        self.sizes: FloatArray | None = None  # (n_envs,) sums of that over running episodes, before this round
         self.seen: list[Episodes] = []  # of this iteration's rounds
         self.gradient_steps = gradient_steps(model)  # as of the last decision
         self.scored: dict[str, NDArray[Any]] = {}  # weights that `values` belong to, where scales change
@@ -140,7 +142,6 @@ class Session:
         else:
             self._round_steps = most = -(-wanted // rollout) * rollout
         self._length = -(-most // env.num_envs)
-        self._one_rollout = self._round_steps == rollout
 
     def _make(self) -> None:
         """The curriculum, its host, and whoever scores instances, of the environment's seed."""
@@ -294,24 +295,28 @@ class Session:
         broken = self._open and self._on_policy  # SB3 has thrown away what was collected
         if self._plays and not broken and env.time * env.num_envs >= self._round_steps:
             decided = self._end_round()
-        if not self._plays or broken:
+        begins = not self._plays or broken
+        if begins:
             self._begin_round()
             if self._restored_random is not None:
                 _restore_random(self._model, self._restored_random)
                 self._restored_random = None
+        if begins or self._on_policy:
             self._write()
         self._open = True
         return decided
 
     def on_rollout_end(self) -> None:
-        """Note the advantages before the update lays them out in its own way."""
+        """Note what is learnt from, and its advantages before the update lays them out in its own way."""
         self._open = False
+        if self._on_policy:
+            self.learnt = self.env.played()
         if self._wants.advantages:
             model: Any = self._model
             advantages: FloatArray = (
                 model.rollout_buffer.advantages.astype(np.float64) * self.wrapped.statistics.reward_std
             )
-            self._sizes_now.append(self._wants.counted(advantages))
+            self.sizes_now.append(self._wants.counted(advantages))
 
     def on_training_end(self) -> bool:
         """A round ends with `learn`, unless its last rollout was broken off and will never be learnt from."""
@@ -330,8 +335,9 @@ class Session:
         start = walk.position(self.selection, 0, 1)
         self._plan = RoundPlan(self.selection, start, self._gamma, env.run_seed, self.round, unfinished)
         current = env.begin_round(self._plan, length=self._length, record=self._ensemble is not None)
+        if self.learnt is not None:  # in this round, which was broken off in a later rollout
+            current = env.play_again(self.learnt)
         self.wrapped.put(self._model, current)
-        self._sizes_now = []
 
     def _end_round(self) -> bool:
         """Take in what a round showed, behind its update, and decide where an iteration is over."""
@@ -342,12 +348,13 @@ class Session:
         if self._wants.episodes:
             means = None
             if self._wants.advantages:
-                sizes = np.concatenate(self._sizes_now)
+                sizes = np.concatenate(self.sizes_now)
                 before = np.zeros(sizes.shape[1]) if self.sizes is None else self.sizes
                 means, self.sizes = mean_sizes([shard], sizes, before)
             self.seen.append(curriculum_episodes(self.env.instances, [shard], means))
         if self._ensemble is not None:
             self._ensemble.update([shard], self.wrapped.statistics, round=shard.round)
+        self.learnt, self.sizes_now = None, []
         if self.rounds_left > 0:
             return False
         self._decide()
@@ -426,6 +433,10 @@ class Session:
             arrays |= {f"seen/{name}": array for name, array in vars(joined_episodes(self.seen)).items()}
         if self.sizes is not None:
             arrays["sizes"] = self.sizes
+        if self.learnt is not None:
+            arrays |= {f"learnt/{name}": array for name, array in vars(self.learnt).items()}
+        if self.sizes_now:
+            arrays["sizes_now"] = np.concatenate(self.sizes_now)
         if self._ensemble is not None:
             arrays |= {f"ensemble/{name}": array for name, array in self._ensemble.save().items()}
         random_arrays, random_numbers = _random_state(self._model)
@@ -438,6 +449,7 @@ class Session:
             "run": {
                 "seed": self.env.run_seed, "steps": self._model.num_timesteps, "rounds_left": self.rounds_left,
                 "walk": [self.walk.order_version, list(self.walk.positions)], "gradient_steps": self.gradient_steps,
+                "gradient_steps_now": gradient_steps(self._model),
             },
         }  # fmt: skip
         return Checkpoint(self.round, arrays, data)
@@ -481,12 +493,36 @@ class Session:
         if self._ensemble is not None:
             self._ensemble.load(_under("ensemble/", arrays))
         behind = model.num_timesteps - int(run["steps"])
-        most = self._round_steps if self._on_policy and self._one_rollout else 0
-        if 0 <= behind <= most:  # what on-policy models had collected since, SB3 does not save: it is collected again
+        rollout = model.n_steps * env.num_envs if isinstance(model, OnPolicyAlgorithm) else 0
+        learnt_since = gradient_steps(model) != run.get("gradient_steps_now", gradient_steps(model))
+        goes_on = self._restore_round(arrays) and not learnt_since
+        if goes_on and 0 <= behind <= rollout:  # what had been collected since, SB3 does not save: collected again
             model.num_timesteps = int(run["steps"])
             self._restored_random = {**_under("random/", arrays), "numbers": checkpoint.data["random"]}
-        elif behind > 0:  # saved in the midst of a round, whose first steps were learnt from: go on with another
+        elif behind > 0 or not goes_on:  # in the midst of a round, whose first steps were learnt from: another follows
             self.round += 1
+            self.learnt, self.sizes_now = None, []
+
+    def _restore_round(self, arrays: Mapping[str, NDArray[Any]]) -> bool:
+        """Take in which rollouts of a round were learnt from; False: it cannot go on, for it had another shape."""
+        found, model = _under("learnt/", arrays), self._model
+        if not found:
+            return True
+        learnt = Played(**found)
+        steps, slots = learnt.rewards.shape
+        shape = (steps, slots, *(self.env.action_space.shape or ()))
+        if learnt.actions.shape != shape or learnt.actions.dtype.kind not in "if" or learnt.rewards.dtype != np.float64:
+            raise ValueError("what was played of its round is not that of this environment")
+        if not isinstance(model, OnPolicyAlgorithm) or slots != self.env.num_envs:
+            return False
+        if steps % model.n_steps or steps + model.n_steps > self._length:
+            return False
+        self.learnt = learnt
+        if self._wants.advantages:
+            self.sizes_now = [arrays["sizes_now"]]
+            if self.sizes_now[0].shape != (steps, slots):
+                raise ValueError("the advantages of its round are not those of its steps")
+        return True
 
     def _unfinished(self, arrays: Mapping[str, NDArray[Any]]) -> tuple[Unfinished, ...]:
         found = _under("unfinished/", arrays)

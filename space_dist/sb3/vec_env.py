@@ -30,7 +30,7 @@ from space_dist.envs.interface import opened
 from space_dist.envs.observations import Observations, allocate, concatenate, put, take
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
-from space_dist.rollout import EpisodeTable, Shard, Stage, Walking, endless, replayed
+from space_dist.rollout import EpisodeTable, Shard, Stage, Walking, another_way, endless, replayed
 from space_dist.rollout.walk import Unfinished
 
 _FREE = 1 << 32  # the first round of an environment that nobody drives; no run has so many
@@ -48,6 +48,14 @@ class RoundPlan:
     round: int
     unfinished: Unfinished | None = None
     shard: int = 0
+
+
+@dataclass(frozen=True)
+class Played:
+    """Steps of a round from its first on: (time, n_envs, ...) actions as given, (time, n_envs) rewards in return."""
+
+    actions: NDArray[np.generic]
+    rewards: NDArray[np.float64]
 
 
 class ContextVecEnv(VecEnv):
@@ -145,6 +153,32 @@ class ContextVecEnv(VecEnv):
         """(n_envs,) whether a slot's first step in this round begins an episode."""
         self._start(np.flatnonzero(self.starts))
         return take(self._current, slice(None))
+
+    def played(self) -> Played:
+        """All steps since `begin_round`."""
+        return Played(np.stack(self._executed), np.stack([rewards for rewards, _, _ in self._steps]))
+
+    def play_again(self, before: Played) -> Observations:
+        """Take the steps of `before`, in a round that has just begun as theirs had.
+
+        Returns (n_envs, ...) where all slots stand. Raises SpaceDistError if they earn other rewards.
+        """
+        for actions in before.actions:
+            self.step_async(actions)
+            self.step_wait()
+        earned = self.played().rewards
+        # Equal to the bit or not at all; NaN is equal to itself here.
+        differ = np.argwhere((earned != before.rewards) & ~(np.isnan(earned) & np.isnan(before.rewards)))
+        if len(differ):
+            at = tuple(differ[0].tolist())
+            raise another_way(f"earned {float(earned[at])!r} in a step, and had earned {float(before.rewards[at])!r}")
+        return take(self._current, slice(None))
+
+    @property
+    def begins(self) -> NDArray[np.bool_]:
+        """(n_envs,) where an episode stands before its first step."""
+        fresh: NDArray[np.bool_] = self._table.lengths(self.time) == 0
+        return fresh
 
     def end_round(self) -> Shard:
         """What was played since `begin_round`, as the one shard of a round.
