@@ -424,7 +424,10 @@ def test_over_mazes_neither_interruptions_nor_company_nor_a_fork_change_a_byte(h
     ("settings", "words"),
     [
         ("buffer: 0", "curriculum.buffer"),
-        ("edited: hardest", "curriculum.edited: 'hardest': Input should be 'easiest' or 'batch'"),
+        (
+            "edited: hardest",
+            "curriculum.edited: 'hardest' is not known; did you mean 'easiest'? Allowed: easiest, batch",
+        ),
         ("score: positive_value_los", "curriculum.score"),
         ("replay_share: 0", "curriculum.replay_share"),
         ("edit: 3", "curriculum.edit: unknown key; did you mean 'edits'?"),

@@ -100,6 +100,12 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (["train", CONFIG, "--no-such-option"], ["no-such-option"]),
         (["no-such-command"], ["no-such-command"]),
         (["instances", "sample", "pointmass_unifrom", "--out", "x"], ["did you mean 'pointmass_uniform'?"]),
+        (
+            ["instances", "sample", "unifrm", "--env", "tests.tiny_env:make", "--out", "x"],
+            ["unknown distribution", "mean 'uniform'?"],
+        ),
+        (["report", CONFIG], ["is the config of one run", "report with the run's folder"]),
+        (["train", ROOT / "configs/grids/pointmass_space.yaml"], ["does not exist; did you mean", "/../pointmass_sp"]),
         (["instances", "check", "nowhere.csv"], ["nowhere.csv"]),
         (["instances", "check", str(TRAIN), str(TRAIN)], ["overlap"]),
         (["instances", "check", str(ROOT / "configs/instances/cartpole_train.csv")], ["length", "--env names another"]),
@@ -367,6 +373,39 @@ def test_folders_without_runs_are_an_error(capsys: pytest.CaptureFixture[str], t
     code, _, error = run(capsys, command, tmp_path)
     assert code == 1
     assert str(tmp_path) in error.replace("\n", "")
+
+
+def test_an_interrupted_headroom_goes_on_with_the_same_command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from space_dist.api import headroom
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(headroom, "measure_headroom", interrupted)
+    code, _, error = run(capsys, "headroom", CONFIG, "--seeds", 1)
+    assert code == 75
+    assert "1 run of uniform draws" in error
+    assert "the same command goes on" in error
+
+
+def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "s0").mkdir()
+    (tmp_path / "s0/status.json").touch()
+    code, _, error = run(capsys, "evaluate", tmp_path, "--instances", TEST)
+    told = error.replace("\n", "")
+    assert (code, f"{tmp_path} holds no run: it has no status.json; {tmp_path}/s0 does" in told) == (1, True)
+
+
+def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    words = [sys.executable, "-c", "import os, sys; os.rmdir(os.getcwd()); sys.path.insert(0, sys.argv.pop(1));"
+             "from space_dist.cli import main; main()", str(ROOT), "configs"]  # fmt: skip
+    ended = subprocess.run(words, cwd=gone, capture_output=True, text=True)
+    assert (ended.returncode, "the current folder was removed: cd into" in ended.stderr) == (2, True)
+    assert "Traceback" not in ended.stderr
 
 
 def test_evaluate_without_a_run_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ def test_nothing_moves_before_the_first_episode_has_ended() -> None:
         ("over: set", "curriculum.delta: this key is required"),
         ("delta: 1, target: normal", "target: normal needs target_mean and target_std"),
         ("delta: 1, target_std: [1]", "say nothing with target: set; use target: normal"),
-        ("delta: 1, over: sets", "curriculum.over: 'sets': Input should be 'set' or 'bounds'"),
+        ("delta: 1, over: sets", "curriculum.over: 'sets' is not known; did you mean 'set'? Allowed: set, bounds"),
         ("delta: 1, epsilom: 0.2", "did you mean 'epsilon'?"),
         ("delta: 1, particles: 1", "curriculum.particles"),
     ],

@@ -81,6 +81,7 @@ FACTS: dict[str, Callable[..., dict[str, Any]]] = {
     r"its Ray answers": lambda: {"ray_answers": True},
     r"its Ray does not answer": lambda: {"ray_answers": False},
     r"its (supervisor|worker) is gone": lambda part: {"gone": part},
+    r"its supervisor is gone, with exit code (\d+)": lambda code: {"gone": "supervisor", "gone_code": int(code)},
     r"the worker's node, too": lambda: {"node_alive": False},
     r"all processes there were asked to end by (SIG\w+)": lambda name: {"all_asked": name},
     r"Ray says of its job: `([^`]+)`": lambda message: {"job": message},

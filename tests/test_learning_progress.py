@@ -119,7 +119,10 @@ def test_success_must_be_known_before_the_run_starts() -> None:
         ("outcome: return, lowest_return: 2, largest_return: 1", "lowest_return: 2 must be below largest_return: 1"),
         ("outcome: return", "outcome: return needs largest_return"),
         ("outcome: return, lowest_return: -1", "outcome: return needs largest_return"),
-        ("outcome: returns", "curriculum.outcome: 'returns': Input should be 'success' or 'return'"),
+        (
+            "outcome: returns",
+            "curriculum.outcome: 'returns' is not known; did you mean 'return'? Allowed: success, return",
+        ),
         ("theta: 1", "curriculum.theta"),
         ("smooting: 0.2", "did you mean 'smoothing'?"),
     ],

@@ -170,6 +170,20 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
     assert ended == Ended(Cause.KILLED, "its supervisor was killed")
 
 
+def test_a_supervisor_that_ends_by_itself_is_a_crash_and_says_where_to_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(warm, "PYTHON", (sys.executable, "-c", "raise SystemExit('nothing works here')"))
+    made = plan(write(tmp_path), tmp_path / "runs")
+    found: list[tuple[Any, Ended | None]] = []
+    with LocalExecutor(made.grid, made.manifest, 1, lambda: None) as place:
+        place.start([(made.manifest.runs()[0], 1)])
+        await_(lambda: bool(found.extend(place.poll()) or found), "the attempt to end")
+    [(_, ended)] = found
+    assert ended == Ended(Cause.CRASH, "its supervisor ended with exit code 1: pool.log of the grid says why")
+    assert "nothing works here" in (made.grid.folder / "pool.log").read_text()
+
+
 def test_two_side_by_side_are_the_same_and_one_that_is_killed_costs_the_other_nothing(
     gate: Path, reference: list[list[Row]], tmp_path: Path
 ) -> None:

@@ -512,6 +512,33 @@ def test_commands_of_the_readme_do_nothing_else_when_pasted(manifest: Manifest, 
         assert asked == [["grid", "status", results], ["sync", results, "--uri", "URI"], ["grid", "stop", results]]
 
 
+@pytest.mark.parametrize(
+    ("words", "objects"),
+    [("sbatch: fatal: Could not establish a configuration source", False), ("sbatch: error: Bad constraints", True)],
+)
+def test_a_check_tells_an_objection_from_an_sbatch_without_a_cluster(
+    words: str, objects: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sbatch, out = tmp_path / "bin/sbatch", tmp_path / "out"
+    sbatch.parent.mkdir()
+    sbatch.write_text(f"#!/bin/sh\necho '{words}' >&2\nexit 1\n")
+    sbatch.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{sbatch.parent}:{os.environ['PATH']}")
+    words_typed = ["slurm", "export", GRID, "--out", out, "--profile", SITE, "--check"]
+    monkeypatch.setattr(sys, "argv", ["space-dist", *map(str, words_typed)])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    code = 0
+    try:
+        cli.main()
+    except SystemExit as error:
+        code = int(error.code or 0)
+    told = " ".join(capsys.readouterr().err.split())
+    assert (out / TRAIN).exists()
+    assert code == int(objects)
+    assert (f"not checked by sbatch, which finds no cluster here: {words}" in told) != objects
+    assert ("sbatch objects to" in told) == objects
+
+
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
 def test_bash_and_shellcheck_object_to_no_script(manifest: Manifest, tmp_path: Path) -> None:
     files = []

@@ -15,7 +15,6 @@ from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
 from space_dist.grid.warm import LocalExecutor, WarmPlaces, needs_ray
 from space_dist.system.extras import needed_from
-from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import code_digest
 from space_dist.system.workplace import cores, lasting, private_ray, workplace
@@ -90,7 +89,6 @@ def run_grid(
     Runs that fail are noted (`GridRun.statuses`) and raise nothing. Raises ConfigError for every fault of the files,
     LedgerError if the folder cannot be written.
     """
-    look_here_too()
     base = workplace() / "runs" if root is None else lasting(Path(root), "root")
     named = grid.folder if isinstance(grid, Grid | GridRun) else Path(grid)
     stop = StopRequests()

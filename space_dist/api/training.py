@@ -21,7 +21,6 @@ from space_dist.report import draw_learning_curve, load_run
 from space_dist.report.figures import png
 from space_dist.run.launch import launch, stored_config
 from space_dist.run.training import Progress
-from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import default_folder, lasting
 
@@ -141,7 +140,6 @@ def train(
     the run's folder asked for that; SpaceDistError if it failed. After KeyboardInterrupt, `resume=True` goes on from
     the last checkpoint.
     """
-    look_here_too()
     run = as_config(config, overrides, seed=seed, workers=workers)
     folder = default_folder(run.name, run.seed) if out is None else lasting(Path(out), "out")
     source = str(config) if isinstance(config, str | Path) else _SOURCE

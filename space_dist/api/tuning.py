@@ -15,7 +15,6 @@ from space_dist.experiment.tuning import find_tune
 from space_dist.grid.conductor import Overview, working_on
 from space_dist.grid.warm import WarmPlaces
 from space_dist.system.extras import needed_from
-from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import lasting, workplace
 
@@ -42,7 +41,6 @@ def run_search(
     failed. Raises ConfigError for every fault of the files, LedgerError if the folder cannot be written, SpaceDistError
     if runs failed for reasons that say nothing of their settings.
     """
-    look_here_too()
     base = workplace() / "runs" if root is None else lasting(Path(root), "root")
     stop = StopRequests()
     with WarmPlaces(max_parallel) as warm, shown(progress is True) as show:

@@ -6,6 +6,7 @@ from space_dist.cli.terminal import keep_outputs, say, spread, warn  # isort: sk
 
 import os
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -20,8 +21,7 @@ from space_dist.cli.inputs import config_app, instances_app
 from space_dist.cli.slurm import slurm_app
 from space_dist.cli.tuning import tune_app
 from space_dist.cli.worlds import env_app, render
-from space_dist.errors import SpaceDistError
-from space_dist.system.importing import look_here_too
+from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.system.processes import collect_seldom
 
 app = typer.Typer(
@@ -63,7 +63,11 @@ def main() -> None:
     keep_outputs()
     for sentence in overruled():
         warn(f"space-dist: {sentence}")
-    look_here_too()  # import paths in configs may name the user's own modules
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        warn("space-dist: the current folder was removed: cd into one that is there")
+        sys.exit(ConfigError.exit_code)
     try:
         app(args=spread(sys.argv[1:]))
     except SpaceDistError as error:

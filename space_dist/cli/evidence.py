@@ -8,7 +8,8 @@ from typing import Annotated, Optional
 import typer
 
 from space_dist.cli.grids import print_json
-from space_dist.cli.terminal import Json, Overrides, console, delivered, say
+from space_dist.cli.terminal import Json, Overrides, console, delivered, say, warn
+from space_dist.errors import Interrupted
 
 
 def fork(
@@ -61,14 +62,17 @@ def headroom(
 
     settings = as_config(config, overrides or ())
     folder = workplace() / "runs" / f"{settings.name}_headroom" if out is None else out
-    found = measure_headroom(settings, out=folder, steps=steps, seeds=seeds, progress=console.is_terminal)
+    runs = "1 run" if seeds == 1 else f"{seeds} runs"
+    warn(f"{settings.name}: {runs} of uniform draws, in {folder}")
+    try:
+        found = measure_headroom(settings, out=folder, steps=steps, seeds=seeds, progress=console.is_terminal)
+    except KeyboardInterrupt:
+        raise Interrupted("ending with checkpoints; the same command goes on from there") from None
     rows, words = reports.table(found.headroom), reports.in_words(found.headroom)
     if as_json:
         print_json({"folder": str(found.folder), "shares": rows, "words": words})
         return
-    shown = Table(
-        title=f"{settings.name}: {len(found.train)} instances, uniform draws, {seeds} seeds", title_justify="left"
-    )
+    shown = Table(title=f"{settings.name}: {len(found.train)} instances, uniform draws, {runs}", title_justify="left")
     for column in rows[0]:
         shown.add_column(column, justify="right")
     for row in rows:

@@ -38,7 +38,13 @@ def instances_sample(
     """Draw disjoint training and test instances."""
     from space_dist.envs import distribution_of
     from space_dist.envs.distributions import DISTRIBUTIONS, sample
+    from space_dist.instances import shown
 
+    if distribution not in (allowed := ("uniform", *DISTRIBUTIONS)):
+        raise ConfigError(
+            f"unknown distribution {shown(distribution)}{nearest(distribution[:100], allowed)} "
+            f"(known are {', '.join(allowed)})"
+        )
     if (distribution == "uniform") != (env is not None):
         raise ConfigError("`instances sample uniform` needs --env, and no other distribution takes it")
     known = DISTRIBUTIONS if env is None else {"uniform": distribution_of(env, parse_kwargs(kwarg))}

@@ -39,6 +39,7 @@ Interface = Annotated[Optional[str], typer.Option()]  # noqa: UP045 - typer read
 _MODES = ("array", "cluster")
 _UNFINISHED = 3  # the exit code of `slurm advance` where something is to be submitted
 _SECONDS = 60.0  # for sbatch, which waits for a busy controller
+_NO_CLUSTER = ("Could not establish a configuration source", "Unable to contact slurm controller")  # sbatch's words
 
 
 @slurm_app.command("export")
@@ -277,6 +278,11 @@ def _check(folder: Path, scripts: tuple[str, str, str]) -> None:
                 )
             except subprocess.TimeoutExpired:
                 raise SpaceDistError(f"{program} does not answer within {_SECONDS:.0f} s") from None
+            said = (done.stdout + done.stderr).strip()
+            if done.returncode and program == "sbatch" and any(words in said for words in _NO_CLUSTER):
+                warn(f"not checked by sbatch, which finds no cluster here: {said.splitlines()[-1]}")
+                break
             if done.returncode:
-                raise SpaceDistError(f"{program} objects to {folder / file}:\n{(done.stdout + done.stderr).strip()}")
-        say(f"{' '.join([program, *options])}: no objection")
+                raise SpaceDistError(f"{program} objects to {folder / file}:\n{said}")
+        else:
+            say(f"{' '.join([program, *options])}: no objection")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import types
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -120,6 +121,11 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         if isinstance(context.get("error"), UriError):
             return f"{where}: {key}: {message}"
         return f"{where}: {key}: {message}, not {short(given)}"
+    if kind == "literal_error" and isinstance(given, str):
+        words = re.findall(r"'([^']+)'", str(context.get("expected")))
+        return f"{where}: {key}: {short(given)} is not known{nearest(given, words)} Allowed: {', '.join(words)}"
+    if kind == "tuple_type":
+        return f"{where}: {key}: {short(given)}: Input should be a list"
     return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
 
 

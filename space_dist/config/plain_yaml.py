@@ -49,7 +49,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         folder = path.parent
         siblings = [str(file) for file in folder.glob("*.yaml")] if folder.is_dir() else []
-        raise ConfigError(f"{path} does not exist{nearest(str(path), siblings)}") from None
+        above = folder / ".." / path.name
+        hint = f"; did you mean {str(above)!r}?" if above.is_file() else nearest(str(path), siblings)
+        raise ConfigError(f"{path} does not exist{hint}") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > _MAX_CONFIG_BYTES:

@@ -108,8 +108,9 @@ class Evidence:
     minutes, that it took longer than. over_memory: what it used and `memory_mb`, both in MB. halted_seconds: how long
     it was stopped (SIGSTOP). runs: how many shared the process. stop_file: the grid's folder has a file `stop`.
     Ray. has_actors: the run has some. ray_answers: the Ray that it joined does. gone: which process above the run is
-    missing. node_alive: that of the pool's worker is. all_asked: by what all processes were asked to end; empty if they
-    were not. job: what Ray says of a job that has ended; None if there was none. job_succeeded: Ray says so.
+    missing. gone_code: its exit code, where that was seen. node_alive: that of the pool's worker is. all_asked: by what
+    all processes were asked to end; empty if they were not. job: what Ray says of a job that has ended; None if there
+    was none. job_succeeded: Ray says so.
     SLURM. requeued: it has begun its job anew since.
     began_on: the host of a supervisor that is gone; empty if that was not looked up.
     """
@@ -130,6 +131,7 @@ class Evidence:
     has_actors: bool = False
     ray_answers: bool = True
     gone: Literal["supervisor", "worker"] | None = None
+    gone_code: int | None = None
     node_alive: bool = True
     all_asked: str = ""
     job: str | None = None
@@ -220,6 +222,10 @@ def _not_seen_to_end(seen: Evidence) -> Ended:
     if seen.gone is not None and seen.all_asked:
         # A batch system that ends a job signals all its processes, and so us, too: that is nobody's failure.
         return Ended(Cause.PREEMPTED, f"all processes were asked to end ({seen.all_asked})")
+    if seen.gone is not None and (seen.gone_code or 0) > 0:  # by itself, and before it could begin the run
+        return Ended(
+            Cause.CRASH, f"its {seen.gone} ended with exit code {seen.gone_code}: pool.log of the grid says why"
+        )
     if seen.gone is not None:
         return Ended(Cause.KILLED, f"its {seen.gone} was killed")
     if seen.job is not None:

@@ -191,7 +191,7 @@ class GridConfig(Section):
             if unknown:
                 raise ValueError(
                     f"exclude and baseline name cells by axes of this grid; {unknown[0]} is none"
-                    f"{nearest(unknown[0], known)} Axes: {', '.join(known) or 'none'}"
+                    f"{nearest(unknown[0], known)} Either may be misspelt. Axes: {', '.join(known) or 'none'}"
                 )
         return self
 
@@ -235,9 +235,7 @@ def load_grid(
     """
     place = configs.located(path)
     data = configs.read_yaml(place)
-    if "env" in data and "extends" not in data:
-        raise ConfigError(f"{path} is the config of one run: space-dist train {path}. A grid names it with `extends`")
-    _refuse_search(data, path)
+    _refuse_others(data, path)
     grid = configs.check(GridConfig, data, str(path))
     _refuse_changes(grid, changes)
     folder = place.absolute().parent
@@ -284,7 +282,13 @@ def _refuse_changes(grid: GridConfig, changes: Sequence[str]) -> None:
                 )
 
 
-def _refuse_search(data: Mapping[str, Any], path: Path) -> None:
+def _refuse_others(data: Mapping[str, Any], path: Path) -> None:
+    """Raise ConfigError for what is a config, and of no grid."""
+    if "env" in data and "extends" not in data:
+        raise ConfigError(
+            f"{path} is the config of one run: space-dist train {path}, and space-dist report with the run's folder. "
+            "A grid names it with `extends`"
+        )
     if "arms" in data:
         raise ConfigError(f"{path} is a search: space-dist tune run {path}. A grid has no `arms`")
 
@@ -610,7 +614,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
     data = configs.read_yaml(configs.located(path))
-    _refuse_search(data, path)
+    _refuse_others(data, path)
     config = configs.check(GridConfig, data, str(path))
     grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale), changes))
     if not grid.manifest_file.exists():

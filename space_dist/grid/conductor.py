@@ -69,7 +69,7 @@ def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Ma
     if before is not None and (before.search is None) != (manifest.search is None):
         there, ours = ("a search", "grid") if manifest.search is None else ("a grid", "search")
         raise ConfigError(
-            f"{grid.folder} holds {there} of this name; give the {ours} another name, or use another --root"
+            f"{grid.folder} holds {there} of this name; give the {ours} another name, or it another folder"
         )
     if before is not None:
         # Another version of this package does not make it another grid: its finished runs stay and are shown as such.

@@ -48,13 +48,13 @@ class PoolWorker:
         refuse_other_folder(Path(folder), nonce)
         self._supervisor = WarmSupervisor()
 
-    def attempt(self, task: Task) -> list[dict[str, Any]] | None:
-        """How the attempts of a task ended; None if the supervisor was lost with them."""
+    def attempt(self, task: Task) -> list[dict[str, Any]] | int | None:
+        """How the attempts of a task ended; if the supervisor was lost with them, `SupervisorLostError.code`."""
         self._supervisor.begin(task)
         try:
             return self._supervisor.ended()
-        except SupervisorLostError:
-            return None
+        except SupervisorLostError as lost:
+            return lost.code
 
     def stop(self) -> None:
         """Ask the live attempt to checkpoint and end."""
@@ -149,8 +149,8 @@ class Pool:
                 if attempts and ray.wait([slot.answer], timeout=0)[0]:
                     ends = ray.get(slot.answer)
                     slot.attempts, slot.answer = (), None
-                    if ends is None:
-                        ended += all_lost(self._grid, attempts, supervisor_lost(self._stop_requested()))
+                    if ends is None or isinstance(ends, int):
+                        ended += all_lost(self._grid, attempts, supervisor_lost(self._stop_requested(), ends))
                     else:
                         ended += understood(attempts, ends)
                 else:

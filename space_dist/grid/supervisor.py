@@ -41,7 +41,6 @@ from space_dist.experiment.endings import AskedBy, Busy, Ended, Evidence, Said, 
 from space_dist.experiment.manifest import Grid, Manifest, Run, RunResources
 from space_dist.experiment.status import Attempts, is_done, last_lines, slurm_job
 from space_dist.system.files import appending, open_own
-from space_dist.system.importing import look_here_too
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.processes import collect_seldom
 
@@ -432,7 +431,6 @@ class _Manager:
 def main() -> None:
     """Attempt every task that comes, one after another."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever manages us
-    look_here_too()  # import paths in configs may name the user's own modules
     results = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is not a result
     collect_seldom()

@@ -90,7 +90,7 @@ def _begun(grid: Grid) -> Manifest | None:
     manifest = grid.manifest()
     if manifest.search is None:
         raise ConfigError(
-            f"{grid.folder} holds a grid of this name; give the search another name, or use another --root"
+            f"{grid.folder} holds a grid of this name; give the search another name, or it another folder"
         )
     return manifest
 

@@ -38,7 +38,11 @@ _AHEAD = 8  # supervisors that are started before it is known how many are wante
 
 
 class SupervisorLostError(Exception):
-    """It ended, or was killed, before it said how its attempts ended."""
+    """It ended, or was killed, before it said how its attempts ended. code: its exit code, minus a signal's number."""
+
+    def __init__(self, code: int | None) -> None:
+        super().__init__(code)
+        self.code = code
 
 
 class WarmSupervisor:
@@ -67,7 +71,7 @@ class WarmSupervisor:
 
         Raises SupervisorLostError if it cannot say so any more.
         """
-        process = self._process
+        process, code = self._process, None
         while process is not None and process.stdout is not None:
             line, newline, rest = self._words.partition(b"\n")
             if newline:
@@ -81,11 +85,11 @@ class WarmSupervisor:
             chunk = os.read(process.stdout.fileno(), _CHUNK)
             # End of file: it is gone, and waiting reaps it.
             if not chunk:
-                process.wait()
+                code = process.wait()
                 self._process = None
                 break
             self._words += chunk
-        raise SupervisorLostError
+        raise SupervisorLostError(code)
 
     def stop(self) -> None:
         """Ask the live attempts to checkpoint and end."""
@@ -185,12 +189,12 @@ def all_lost(grid: Grid, attempts: Sequence[tuple[Run, int]], seen: Evidence) ->
     return [(run, settled(run, grid.ledger(run), attempt, seen)) for run, attempt in attempts]
 
 
-def supervisor_lost(reason: str | None) -> Evidence:
-    """A supervisor that is gone. reason: why we were asked to end, if we were.
+def supervisor_lost(reason: str | None, code: int | None) -> Evidence:
+    """A supervisor that is gone. reason: why we were asked to end, if we were. code: as of `SupervisorLostError`.
 
     A batch system that ends a job signals all its processes, and so us, too.
     """
-    return Evidence(gone="supervisor", all_asked=reason or "")
+    return Evidence(gone="supervisor", gone_code=code, all_asked=reason or "")
 
 
 @dataclass
@@ -270,9 +274,9 @@ class LocalExecutor:
                 self._look(place)
                 return []
             found = understood(place.attempts, ends)
-        except SupervisorLostError:
+        except SupervisorLostError as lost:
             log.warning("lost a supervisor")
-            found = all_lost(self._grid, place.attempts, supervisor_lost(self._stop_requested()))
+            found = all_lost(self._grid, place.attempts, supervisor_lost(self._stop_requested(), lost.code))
             place.not_before = time.monotonic() + _PAUSE_SECONDS
         place.attempts = ()
         return found

@@ -97,7 +97,9 @@ class Ledger:
         try:
             content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
-            raise LedgerError(f"{self.folder} holds no run: it has no status.json") from None
+            below = next((file.parent for file in sorted(self.folder.glob("*/status.json"))), None)
+            hint = f"; {below} does" if below else ""
+            raise LedgerError(f"{self.folder} holds no run: it has no status.json{hint}") from None
         except OSError as error:
             raise LedgerError(f"{self.status_file} cannot be read: {error.strerror}") from None
         try:

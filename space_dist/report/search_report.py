@@ -275,6 +275,8 @@ def _confirmation(
     """
     confirming = Grid(grid.folder.parent / confirmation_of(manifest.name))
     none = "Its choices are not confirmed yet, so there is no number to report"
+    if not search.over:
+        return [], None, f"{none}: `space-dist tune run {grid.folder}` goes on, and what it chooses is confirmed then."
     if not confirming.manifest_file.exists():
         return [], None, f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it."
     try:

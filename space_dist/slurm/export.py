@@ -86,8 +86,9 @@ class Export:
         if uri is None or not uri.startswith("sqlite:") or Path(uri.removeprefix("sqlite:///")).is_relative_to(results):
             return None
         return (
-            f"tracking.uri: {uri} is a file outside of {results}: where the job that gathers the results does not see "
-            "it, it makes another one there. Set tracking.uri in the grid's file, or MLFLOW_TRACKING_URI, to "
+            f"tracking.uri: {uri} is a file outside of {results}, and maybe of this machine alone: the job that "
+            "gathers the results would then write to a new file of that name on its own node. Set tracking.uri in the "
+            "grid's file, or MLFLOW_TRACKING_URI, to "
             f"http(s)://HOST:PORT or sqlite:///{results}/mlflow.db, and export again; or tracking.uri: null, and "
             "`space-dist sync` later"
         )

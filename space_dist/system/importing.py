@@ -7,6 +7,7 @@ import paths name what a user has made, and no function of a library.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.machinery
@@ -31,7 +32,8 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 def look_here_too() -> None:
     """Look for a user's own modules in the current folder, after everywhere else."""
-    look_in([str(Path.cwd())])
+    with contextlib.suppress(FileNotFoundError):  # a folder that was removed holds none
+        look_in([str(Path.cwd())])
 
 
 def look_in(folders: Iterable[str]) -> None:
