@@ -296,9 +296,9 @@ def fastest(task: str, contenders: Sequence[Contender], seconds: float) -> Conte
 def _waits(contender: Contender, costs: dict[str, float]) -> dict[str, float]:
     """Seconds per environment step of the simulator and of arithmetic, as far as they cannot run side by side.
 
-    Nothing of JAX, whose simulator is its own.
+    Nothing of JAX, and of ours that are compiled: neither simulator nor arithmetic is then what was measured alone.
     """
-    if contender.kind == "jax":
+    if contender.kind == "jax" or (contender.kind == "ours" and contender.update != "stock"):
         return {}
     batched = contender.kind == "ours" or contender.vec_env == "batched"
     processes = {"ours": contender.workers, "rllib": contender.runners}.get(
@@ -329,7 +329,6 @@ def _population_rows(
     costs = process(specification("pointmass", None, 0.0), Contender("ours").first)
     learning = "collecting and learning alone"
     whole, kernel = "whole wall time: start, evaluation, ledgers and checkpoints included", costs["kernel"] / CORES
-    halves = {"simulator": costs["batched"] / CORES, "arithmetic": costs["arithmetic"] / CORES}
     rows, engine = {}, {"engine": "population"}
 
     def alone(name: str, contender: Contender) -> None:
@@ -355,7 +354,7 @@ def _population_rows(
         rows[of_grid] = Row(
             f"{contender.title}: a grid of 32 runs", whole,
             lambda where=where: {"rate": steps / _grid_seconds(member_steps, MEMBERS, 8, engine, where)},  # type: ignore[misc]
-            halves, kernel,
+            {}, kernel,
         )  # fmt: skip
     return rows
 
