@@ -28,7 +28,7 @@ from space_dist.experiment.status import (
     run_status_of,
     settled,
 )
-from space_dist.grid import supervisor
+from space_dist.grid import conductor, supervisor
 from space_dist.grid.conductor import Conductor
 from space_dist.grid.planning import plan
 from space_dist.ledger import METRICS, Lock, Row
@@ -444,6 +444,18 @@ def test_runs_that_can_share_a_process_are_dealt_evenly_to_all_places(tmp_path: 
     Conductor(made.grid, made.manifest, made.manifest.runs(), script, stop_requested=lambda: None).conduct()
     assert [len(group) for group in script.groups] == [3, 3, 1]
     assert script.groups[2] == [made.manifest.runs()[0].key]
+
+
+@pytest.mark.parametrize(("n_seeds", "groups"), [(5, [3, 3, 3, 1]), (4, [4, 4]), (8, [4, 4, 4, 4]), (9, [3] * 6)])
+def test_turns_are_equal_and_as_few_as_can_be(
+    n_seeds: int, groups: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(conductor.MEMBERS, "cpu", 4)
+    settings = {**SMALL, "engine": "population"}
+    made = plan(write_grid(tmp_path, set=settings, seeds=[*range(n_seeds)]), tmp_path / "runs")
+    script = Script(made.grid, {})  # two places, and two cells
+    Conductor(made.grid, made.manifest, made.manifest.runs(), script, stop_requested=lambda: None).conduct()
+    assert [len(group) for group in script.groups] == groups
 
 
 @pytest.mark.parametrize(("members", "groups"), [(2.5, [2, 2, 2]), (0.0, [1] * 6), (100.0, [6])])

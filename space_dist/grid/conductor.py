@@ -147,6 +147,7 @@ class Conductor:
         self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
+        self._shares: dict[str, tuple[int, int]] = {}  # by stack: the most that have waited, and of these in a process
         self._overview = Overview(len(runs), sum(run.cell.steps_to_take for run in runs))
 
     def conduct(self) -> list[RunStatus]:
@@ -240,15 +241,19 @@ class Conductor:
         most = min(MEMBERS[device], self._fitting(max(run.cell.shared_mb for run in alike)))
         if device == "cuda":  # whose room no core's share of the runs would fill
             return alike[:most]
-        return alike[: min(most, -(-len(alike) // max(1, self._executor.size - self._places_taken())))]
+        waiting, share = self._shares.get(ready[0].cell.stack, (0, 0))
+        if len(alike) > waiting:
+            # All places together work through them in as few turns as they can, and in equal ones: else few would be
+            # left for the last turn, in one place, while the others had nothing to do.
+            turns = -(-len(alike) // (most * self._executor.size))
+            share = -(-len(alike) // (turns * self._executor.size))
+            self._shares[ready[0].cell.stack] = len(alike), share
+        return alike[: min(most, share)]
 
     def _fitting(self, each_mb: int) -> int:
         """How many runs of so much memory a process has room for, at least one."""
         room = self._executor.memory_mb - _LIBRARIES_MB
         return max(1, int(min(room / max(1, each_mb), sys.maxsize)))
-
-    def _places_taken(self) -> int:
-        return self._executor.size - self._executor.room() if self._live else 0
 
     def _next_attempt(self, run: Run) -> int:
         ledger = self._grid.ledger(run)
