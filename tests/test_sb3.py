@@ -372,6 +372,37 @@ def test_a_round_whose_later_rollout_is_cut_keeps_what_was_learnt_from(reset: bo
     assert callback.selection.version == 2  # behind the round, and where learn ended the next one
 
 
+@pytest.mark.parametrize("round_steps", [None, 120])
+@pytest.mark.parametrize("reset", [True, False])
+def test_a_round_whose_last_update_is_interrupted_is_over(
+    reset: bool, round_steps: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, callback = ppo(line_env()), CurriculumCallback(**SPACE, round_steps=round_steps)
+    updates = iter(range(6))
+    train = PPO.train
+
+    def interrupted(self: PPO) -> None:
+        if next(updates) == 2:
+            raise KeyboardInterrupt
+        train(self)
+
+    monkeypatch.setattr(PPO, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(240, callback=callback)
+    before = remembered(model).round
+    driven: list[bool] = []
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            driven.append(self.training_env.driven)
+            return True
+
+    model.learn(40, callback=[callback, Watch()], reset_num_timesteps=reset)
+    assert all(driven)
+    assert len(driven) == 10
+    assert remembered(model).round == before + 2  # the one that was interrupted, and the one that learn ended
+
+
 def test_a_round_goes_on_only_where_it_has_the_same_shape_and_plays_the_same(tmp_path: Path) -> None:
     asked = {**SPACE, "round_steps": 120}
     ppo(line_env()).learn(240, callback=[CurriculumCallback(**asked), CheckpointCallback(25, str(tmp_path))])

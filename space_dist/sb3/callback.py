@@ -37,8 +37,7 @@ class CurriculumCallback(BaseCallback):
 
     Raises ConfigError if kind or settings are wrong; and when `learn` begins, if it was given two of these, the model,
     its environment or its instances cannot give the curriculum what it asks for, or the model remembers another
-    curriculum. Raises
-    SpaceDistError if training diverges, or what the model remembers cannot be read.
+    curriculum. Raises SpaceDistError if training diverges, or what the model remembers cannot be read.
     """
 
     def __init__(

@@ -298,6 +298,9 @@ class Session:
         begins = not self._plays or broken
         if begins:
             self._begin_round()
+            if env.time * env.num_envs >= self._round_steps:  # it was broken off behind its last rollout
+                decided = self._end_round()
+                self._begin_round()
             if self._restored_random is not None:
                 _restore_random(self._model, self._restored_random)
                 self._restored_random = None
