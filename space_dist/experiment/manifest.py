@@ -303,12 +303,23 @@ def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:
             parts.append(Path(value).stem)
         elif key == "schedule":
             parts.append(_changes(value))
+        elif key == "instances" and isinstance(value, dict):
+            parts.append(_sets(value))
         elif isinstance(value, dict):
             rest = [f"{name}={_word(item)}" for name, item in value.items() if name != "kind"]
             parts.append(" ".join([_word(value["kind"]) if "kind" in value else end, *rest]))
         else:
             parts.append(f"{end if ends.count(end) == 1 else key}={_word(value)}")
     return " ".join(parts)[:_MAX_LABEL] or "all"
+
+
+def _sets(instances: Mapping[str, Any]) -> str:
+    """`maze_dfs` for maze_dfs_train.csv and maze_dfs_test.csv; else each file's name without its folder and ending."""
+    stems = {name: Path(str(file)).stem for name, file in instances.items()}
+    whole = str(stems.get("train")).removesuffix("_train")
+    if stems == {"train": f"{whole}_train", "test": f"{whole}_test"}:
+        return whole
+    return " ".join(f"{name}={stem}" for name, stem in stems.items())
 
 
 def _changes(schedule: Any) -> str:
