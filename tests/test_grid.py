@@ -17,7 +17,7 @@ from space_dist.cli.grids import grid_retry
 from space_dist.cli.overview import print_failures
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause, Ended
-from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, find_grid
+from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, find_grid, label_of
 from space_dist.experiment.status import (
     Attempts,
     exit_code,
@@ -423,3 +423,16 @@ def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:
             read()
     assert queue_of(grid.folder) is None
     assert last_lines(attempts.path) == []
+
+
+@pytest.mark.parametrize(
+    ("instances", "label"),
+    [
+        ({"train": "../sets/maze_dfs_train.csv", "test": "../sets/maze_dfs_test.csv"}, "maze_dfs kappa=4"),
+        ({"train": "a_train.csv", "test": "b_test.csv"}, "train=a_train test=b_test kappa=4"),
+        ({"train": "sets/one.csv"}, "train=one kappa=4"),
+    ],
+)
+def test_cells_are_called_by_their_instance_sets(instances: dict[str, str], label: str) -> None:
+    point = {"instances": instances, "curriculum.kappa": 4}
+    assert label_of(point, list(point)) == label
