@@ -183,6 +183,9 @@ def test_commands_tell_how_a_search_stands(
     assert (planned["new"], planned["trials_in_all"], len(planned["trials"])) == (True, 12, 4)
     assert "goes on in" in said("plan", path)
     assert "4 of 12 trials asked: 4 open" in said("status", path, code=3)
+    underway = said("report", path)
+    assert "not confirmed yet" in underway
+    assert f"space-dist tune run {root / 'search'}" in " ".join(underway.split())
     for run in open_runs(Grid(root / "search").manifest()):
         end(Grid(root / "search"), run, Cause.NODE_LOST if run.seed == 2 else reached(run))
     said("status", path, code=3)  # it will be tried again
