@@ -361,16 +361,26 @@ def verdict(parts: list[Part], *, whole: bool) -> Verdict:
     return "holds in part"
 
 
+def kept(grid: str) -> Artefact | None:
+    """What is kept of a grid: all of it, or else the most that was run of it in small; None where nothing is."""
+    folders = [ROOT / "docs/results" / grid, *(ROOT / "docs/results").glob(f"{grid}-scale-*")]
+    found = [Artefact(folder) for folder in folders if (folder / "provenance.json").exists()]
+    return max(found, key=lambda artefact: artefact.scale, default=None)
+
+
 def table() -> str:
     """Of the claims whose grid was run: what came out, and the verdict."""
     lines = ["| | What came out | Verdict |", "|---|---|---|"]
     for name, (grid, claim) in CLAIMS.items():
-        if not (ROOT / "docs/results" / grid / "provenance.json").exists():
+        if (found := kept(grid)) is None:
             continue
-        found = Artefact(ROOT / "docs/results" / grid)
         parts = claim(found)
         told = "; ".join(part.text + (" ✓" if part.seen else " ✗" if part.contradicted else "") for part in parts)
-        lines.append(f"| [{name}](results/{grid}/report.md) | {told} | *{verdict(parts, whole=found.whole)}* |")
+        small = "" if found.whole else f", scale {found.scale:g}"
+        lines.append(
+            f"| [{name}{small}](results/{found.folder.name}/report.md) | {told} "
+            f"| *{verdict(parts, whole=found.whole)}* |"
+        )
     return "\n".join(lines)
 
 

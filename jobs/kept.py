@@ -90,9 +90,14 @@ class Artefact:
         }  # fmt: skip
 
     @property
+    def scale(self) -> float:
+        """The share of the grid's seeds and steps that was run."""
+        return float(self.provenance["scale"])
+
+    @property
     def whole(self) -> bool:
         """Whether all seeds and steps of the grid were run."""
-        return bool(self.provenance["scale"] == 1.0)
+        return self.scale == 1.0
 
     def rows(self, name: str) -> list[dict[str, str]]:
         """A CSV file's."""

@@ -100,7 +100,8 @@ def test_the_page_says_what_the_kept_results_say() -> None:
     )
     names = [path.parent.name for path in (ROOT / "docs/results").glob("*/provenance.json")]
     assert names, "nothing is kept"
-    assert {*names} <= {*GRIDS}  # none that is in small
+    assert {name.partition("-scale-")[0] for name in names} <= {*GRIDS}
+    assert len({name.partition("-scale-")[0] for name in names}) == len(names), "in small, and whole as well"
     assert made.count("\n| [C") >= len(names)
 
 
@@ -187,6 +188,24 @@ def test_a_claim_is_judged_by_the_rules_of_the_page(
         claims.verdict(parts(claims.Artefact(tmp_path / "docs/results" / name)), whole=False)
         == "not tested at full scale"
     )
+
+
+def test_what_was_run_in_small_is_told_as_such_until_all_of_it_was_run(claims: Any, tmp_path: Path) -> None:
+    def rows() -> list[str]:
+        return [row for row in str(claims.table()).splitlines() if "[C4" in row]
+
+    assert rows() == []
+    for scale in (0.02, 0.3):
+        small = Kept(tmp_path, "ball_catching").curves({"": 10.0})
+        (small.folder / "provenance.json").write_text(json.dumps({"scale": scale}))
+        small.folder.rename(small.folder.with_name(f"ball_catching-scale-{scale}"))
+    (row,) = rows()
+    assert row.startswith("| [C4, scale 0.3](results/ball_catching-scale-0.3/report.md) |")
+    assert row.endswith("| *not tested at full scale* |")
+    Kept(tmp_path, "ball_catching").curves({"": 10.0, "space": 12.0})
+    (row,) = rows()
+    assert row.startswith("| [C4](results/ball_catching/report.md) |")
+    assert row.endswith("| *does not hold here* |")
 
 
 @pytest.mark.parametrize(("least", "most", "other", "verdict"), [
