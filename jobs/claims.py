@@ -361,7 +361,7 @@ def verdict(parts: list[Part], *, whole: bool) -> Verdict:
     return "holds in part"
 
 
-def kept(grid: str) -> Artefact | None:
+def most_of(grid: str) -> Artefact | None:
     """What is kept of a grid: all of it, or else the most that was run of it in small; None where nothing is."""
     folders = [ROOT / "docs/results" / grid, *(ROOT / "docs/results").glob(f"{grid}-scale-*")]
     found = [Artefact(folder) for folder in folders if (folder / "provenance.json").exists()]
@@ -372,7 +372,7 @@ def table() -> str:
     """Of the claims whose grid was run: what came out, and the verdict."""
     lines = ["| | What came out | Verdict |", "|---|---|---|"]
     for name, (grid, claim) in CLAIMS.items():
-        if (found := kept(grid)) is None:
+        if (found := most_of(grid)) is None:
             continue
         parts = claim(found)
         told = "; ".join(part.text + (" ✓" if part.seen else " ✗" if part.contradicted else "") for part in parts)

@@ -100,8 +100,9 @@ def test_the_page_says_what_the_kept_results_say() -> None:
     )
     names = [path.parent.name for path in (ROOT / "docs/results").glob("*/provenance.json")]
     assert names, "nothing is kept"
-    assert {name.partition("-scale-")[0] for name in names} <= {*GRIDS}
-    assert len({name.partition("-scale-")[0] for name in names}) == len(names), "in small, and whole as well"
+    small = {name.partition("-scale-")[0] for name in names if "-scale-" in name}
+    assert small <= {"ant", "ant_vds", "ball_catching"}  # what PyBullet steps; all else is kept whole
+    assert {name for name in names if "-scale-" not in name} <= {*GRIDS} - small
     assert made.count("\n| [C") >= len(names)
 
 
