@@ -32,7 +32,13 @@ def without_ray() -> None:
 
 
 def write(folder: Path, **sections: Any) -> Path:
-    settings = {**TINY, "env": {"id": "tests.slurm.gated_env:make"}, **write_line_instances(folder)}
+    # A dozen rounds: what is done to a run in the middle is not done to one that has ended, on a busy machine either.
+    settings = {
+        **TINY,
+        "env": {"id": "tests.slurm.gated_env:make"},
+        "budget.steps": 3072,
+        **write_line_instances(folder),
+    }
     return write_grid(folder, grid={}, set=settings, **sections)
 
 
