@@ -21,7 +21,9 @@ from space_dist.envs import BatchedEnv, ContextObservation, bullet, make_batched
 from space_dist.envs.distributions import DISTRIBUTIONS, sample
 from space_dist.errors import ConfigError
 from space_dist.instances import read_csv, refuse_overlap
+from space_dist.rollout import Worker, evaluate
 from tests.patience import PATIENCE
+from tests.test_rollout import bits, setup_for, weights_for
 
 ROOT = Path(__file__).parent.parent
 ENVS = {"space_dist/AntGoal-v0": "antgoal_all", "space_dist/BallCatching-v0": "ballcatching_uniform"}
@@ -155,6 +157,22 @@ def test_start_observations_need_one_world(env_id: str) -> None:
     for slot in (0, 57, 99):
         alone = one.reset(np.array([0]), contexts[[slot]], np.array([slot], dtype=np.uint64))
         np.testing.assert_array_equal(alone[0], starts[slot])
+
+
+@both
+def test_measuring_many_episodes_needs_few_worlds(env_id: str) -> None:
+    """Slots that share a world change places at every step, which takes longer than the step."""
+    instances = sample(ENVS[env_id], 20, 1, 0)[0]
+    env = make_batched(env_id, 20, context_visible=True)
+    space, actions = env.observation_space, env.action_space
+    policy = weights_for((space.shape or ())[0], (actions.shape or ())[0])
+    setup = setup_for(env_id, train=instances, test=instances, shards=1)
+    worker, before = Worker(setup), clients()
+    found = worker.evaluate(policy, "train", 0)
+    assert clients() == before + 10  # two turns
+    (expected,) = evaluate(env, [setup.trial(policy, "train", 0)])
+    assert bits(found) == bits(expected)
+    worker.close()
 
 
 @both

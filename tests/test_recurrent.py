@@ -261,6 +261,11 @@ def test_every_measured_episode_begins_with_nothing_remembered() -> None:
         alone += evaluate(one, [Trial(policy, contexts[index : index + 1], seeds[index : index + 1], 0.9)])
     np.testing.assert_allclose(together.returns, [one.returns[0] for one in alone], rtol=1e-5)
     assert together.lengths.tolist() == [one.lengths[0] for one in alone] == [1, 3, 2, 5]
+    for slots in (1, 2, 3):  # those that begin where others have ended, too
+        fewer = make_batched("tests.test_rollout:Countdown", slots, context_visible=False)
+        (in_turns,) = evaluate(fewer, [Trial(policy, contexts, seeds, 0.9)])
+        assert in_turns.returns.tobytes() == together.returns.tobytes()
+        assert in_turns.lengths.tolist() == [1, 3, 2, 5]
 
 
 def test_start_values_are_those_of_episodes_that_begin() -> None:

@@ -519,6 +519,9 @@ def test_outcomes_are_the_same_whatever_is_measured_beside_them(env_id: str, nor
         together = evaluate(env, [again[index] for index in chosen])
         assert all(same(outcomes, alone[index]) for outcomes, index in zip(together, chosen, strict=True))
     assert not same(alone[0], alone[1])
+    for slots in (1, 4, 34):  # fewer than episodes: the next begins where one has ended
+        in_turns = evaluate(make_batched(env_id, slots, context_visible=True), trials())
+        assert all(same(outcomes, expected) for outcomes, expected in zip(in_turns, alone, strict=True))
 
 
 class Unpunctual(Countdown):
@@ -550,6 +553,14 @@ def test_an_episode_beyond_the_horizon_is_noticed_at_its_step() -> None:
     with pytest.raises(SpaceDistError, match="after its horizon of 3 steps"):
         collect(slot, [dataclasses.replace(again, policy=dataclasses.replace(policy, version=1))], length=40)
     assert env.made == 3 + 2 + 1
+
+
+def test_an_episode_beyond_the_horizon_is_noticed_where_it_is_measured_after_others() -> None:
+    env, seeds = Unpunctual(1), np.arange(3, dtype=np.uint64)
+    trial = Trial(weights_for(2, 1), np.array([[2.0], [1.0], [100.0]]), seeds, 0.9)
+    with pytest.raises(SpaceDistError, match="after its horizon of 3 steps"):
+        evaluate(env, [trial])  # type: ignore[arg-type]
+    assert env.made == 2 + 1 + 3
 
 
 def test_only_equals_act_side_by_side() -> None:

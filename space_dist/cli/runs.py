@@ -101,7 +101,7 @@ def evaluate(
     chosen = read_csv(located(instances), spec.context_bounds, config.columns_read, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     optimum = None
-    with exits_refused(), spec.opened(len(chosen)) as env:
+    with exits_refused(), spec.opened(spec.slots_for(len(chosen))) as env:
         outcomes = [evaluate_policy(env, [Trial(policy, chosen.contexts, seeds, config.learner.gamma)])[0]
                     for policy in policies]  # fmt: skip
         if isinstance(world := unwrapped(env), KnowsOptimum):

@@ -19,6 +19,10 @@ from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
 
+SLOTS_ONE_BY_ONE = 16
+"""Slots of an environment that steps them one after another, at most, where it is left to us: episodes of unequal
+length leave few of them idle at the end, and a policy's call is still shared. Decides no result."""
+
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
@@ -51,6 +55,13 @@ class EnvironmentSpec:
         if self.compiled and isinstance(inner, Compilable):
             inner.compile_physics()
         return env
+
+    def slots_for(self, episodes: int) -> int:
+        """Slots in which to play so many episodes soonest: equal shares, or all at once where that takes no longer."""
+        if not self.one_by_one:
+            return episodes
+        turns = -(-episodes // SLOTS_ONE_BY_ONE)
+        return -(-episodes // turns)
 
     def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
         """A new environment for as long as the context lasts."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.envs import BatchedEnv
-from space_dist.envs.observations import put, take
+from space_dist.envs.observations import allocate, each, put
 from space_dist.rollout.collecting import endless
 from space_dist.rollout.memory import Memory
 from space_dist.rollout.policy import Noise, Policy, batched
@@ -57,49 +58,70 @@ class Trial:
 
 
 def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
-    """Measure trials of equally many episodes in one batch, all deterministic or none.
+    """Measure trials of equally many episodes, all deterministic or none, in slots for all of them or for fewer.
 
-    The outcomes of one have the same bits whatever is measured beside it.
+    Where there are fewer slots, the next episode begins where one has ended. The outcomes of a trial have the same bits
+    in any number of slots, whatever is measured beside it.
     """
-    count, slots, n_slots = len(trials[0]), np.arange(env.n_slots), env.n_slots
+    count, n_slots = len(trials[0]), env.n_slots
     acting = batched([trial.policy for trial in trials], count)
+    contexts = np.concatenate([trial.contexts for trial in trials])
+    seeds = np.concatenate([trial.seeds for trial in trials])
+    gamma = np.repeat([trial.gamma for trial in trials], count)
     noise = None
     if trials[0].random is not None:
         shape = (env.horizon, count)
         noise = Noise.joined([Noise.draw(trial.policy.head, env.action_space, trial.random(), shape)
                               for trial in trials if trial.random is not None])  # fmt: skip
-    contexts = np.concatenate([trial.contexts for trial in trials])
-    seeds = np.concatenate([trial.seeds for trial in trials])
-    gamma = np.repeat([trial.gamma for trial in trials], count)
-    # Copied: what an environment returns may be its own memory.
-    observations = take(env.reset(slots, contexts, seeds), slice(None))
-    memory = Memory(acting, n_slots)
-    alive = np.ones(n_slots, dtype=np.bool_)
-    returns, discounted, success = np.zeros(n_slots), np.zeros(n_slots), np.full(n_slots, np.nan)
-    lengths, backward = np.zeros(n_slots, dtype=np.int64), np.zeros(n_slots)
-    discount, time = np.ones(n_slots), 0
-    trained = np.full(n_slots, np.iinfo(np.int64).max)  # behind every warm-up and schedule of exploration
+    # By episode from here on, the actions of all of them included: a row is rounded by its place among the others.
+    n = len(seeds)
+    playing, waiting = np.arange(n_slots), n_slots  # the episode in each slot, and the next to begin
+
+    def by_episode(told: NDArray[Any]) -> NDArray[Any]:
+        """What every slot told, where its episode is; zeros where none has told anything."""
+        if n_slots == n:
+            return told
+        spread = np.zeros(n, dtype=told.dtype)
+        spread[playing] = told
+        return spread
+
+    observations = each(np.zeros_like, allocate(env.observation_space, n))
+    put(observations, playing, env.reset(playing, contexts[playing], seeds[playing]))
+    memory = Memory(acting, n)
+    alive = np.arange(n) < n_slots
+    returns, discounted, success = np.zeros(n), np.zeros(n), np.full(n, np.nan)
+    lengths, backward = np.zeros(n, dtype=np.int64), np.zeros(n)
+    discount, time = np.ones(n), 0
+    trained = np.full(n, np.iinfo(np.int64).max)  # behind every warm-up and schedule of exploration
     while alive.any():
         outputs = memory.outputs(observations)
-        chosen = acting.head.best(outputs) if noise is None else acting.head.sampled(outputs, noise, time, trained)
-        step = env.step(acting.head.executed(chosen))
+        chosen = (acting.head.best(outputs) if noise is None
+                  else acting.head.sampled(outputs, noise.at(lengths), 0, trained))  # fmt: skip
+        step = env.step(acting.head.executed(chosen)[playing])
+        rewards, ended = by_episode(step.rewards), by_episode(step.terminated | step.truncated)
         # Horner's rule for the released code's metric, sum r_t gamma^(T-1-t).
-        backward = np.where(alive, gamma * backward + step.rewards, backward)
-        time += 1
-        if time == env.horizon and (alive & ~(step.terminated | step.truncated)).any():
-            raise endless(env)
-        returns += np.where(alive, step.rewards, 0.0)
-        discounted += np.where(alive, discount * step.rewards, 0.0)
+        backward = np.where(alive, gamma * backward + rewards, backward)
+        returns += np.where(alive, rewards, 0.0)
+        discounted += np.where(alive, discount * rewards, 0.0)
+        discount = np.where(alive, discount * gamma, discount)
         lengths += alive
         if step.success is not None:
-            success = np.where(alive, step.success, success)
-        discount *= gamma
-        ended = np.flatnonzero(step.terminated | step.truncated)
-        alive[ended] = False
-        put(observations, slice(None), step.observations)
-        if len(ended) and alive.any():  # every slot must be steppable; what follows in these is not counted
-            put(observations, ended, env.reset(ended, contexts[ended], seeds[ended]))
-            memory.forget(ended)
+            success = np.where(alive, by_episode(step.success), success)
+        time += 1
+        if time >= env.horizon and (alive & ~ended & (lengths >= env.horizon)).any():
+            raise endless(env)
+        put(observations, playing, step.observations)
+        over = np.flatnonzero(step.terminated | step.truncated)
+        free = over[alive[playing[over]]]
+        alive[playing[free]] = False
+        begun = free[: n - waiting]
+        playing[begun] = np.arange(waiting, waiting + len(begun))
+        waiting += len(begun)
+        alive[playing[begun]] = True
+        if len(over) and alive.any():  # every slot must be steppable; what follows where none begins is not counted
+            rows = playing[over]
+            put(observations, rows, env.reset(over, contexts[rows], seeds[rows]))
+            memory.forget(rows)
     return [
         Outcomes(trial.policy.version, returns[mine], discounted[mine], lengths[mine], success[mine], backward[mine])
         for index, trial in enumerate(trials)

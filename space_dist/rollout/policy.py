@@ -148,6 +148,15 @@ class Noise:
             return parts[0]
         return cls(*(np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("drawn", "uniform")))
 
+    def at(self, times: NDArray[np.int64]) -> Noise:
+        """The numbers of a single step, which is another for each slot: `(slots,)` times, the last where beyond it."""
+        slots = np.arange(len(times))
+        drawn, uniform = (
+            part[np.minimum(times, len(part) - 1), slots][None] if part.size else part
+            for part in (self.drawn, self.uniform)
+        )
+        return Noise(drawn, uniform)
+
 
 @dataclass(frozen=True)
 class Statistics:

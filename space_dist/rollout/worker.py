@@ -107,9 +107,10 @@ class Worker:
         if not len(trial):
             return Outcomes.none(trial.policy.version)
         # One environment for each number of slots: parts of a split differ by one episode at most.
-        if len(trial) not in self._evaluating:
-            self._evaluating[len(trial)] = self._make(len(trial))
-        return evaluate(self._evaluating[len(trial)], [trial])[0]
+        slots = self._setup.spec.slots_for(len(trial))
+        if slots not in self._evaluating:
+            self._evaluating[slots] = self._make(slots)
+        return evaluate(self._evaluating[slots], [trial])[0]
 
     def close(self) -> None:
         """Close its environments; what is asked for afterwards makes new ones."""

@@ -150,7 +150,7 @@ class _Promise:
     @property
     def slots(self) -> int:
         """Environments that it takes."""
-        return self.setup.slots if isinstance(self.work, Rollout) else len(self.work)
+        return self.setup.slots if isinstance(self.work, Rollout) else self.setup.spec.slots_for(len(self.work))
 
 
 class _Promising(InProcess):
@@ -291,7 +291,8 @@ class _Workshop:
 
 
 def _parts(promised: Sequence[_Promise]) -> list[list[_Promise]]:
-    """Equal parts that fit the cache."""
-    count = -(-sum(promise.slots for promise in promised) // _SLOTS)
+    """Equal parts that fit the cache; each trial alone in slots that are stepped one after another."""
+    apart = promised[0].setup.spec.one_by_one and isinstance(promised[0].work, Trial)
+    count = len(promised) if apart else -(-sum(promise.slots for promise in promised) // _SLOTS)
     split = np.array_split(np.arange(len(promised)), min(count, len(promised)))
     return [[promised[place] for place in places] for places in split]
