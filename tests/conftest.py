@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -72,6 +72,40 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             rank = places.get(item.path.relative_to(here).with_suffix("").as_posix(), rank)
         ranks[item.path] = min(rank, ranks.get(item.path, rank))
     items.sort(key=lambda item: ranks[item.path])
+    _until[0] = sum(os.times()[:4])  # what was imported is no test's
+
+
+_CPU = "cpu_seconds"
+_COSTLY_FILES = 25  # of which a run of the whole suite tells what they took
+_until = [0.0]  # CPU seconds of this process, and of children that it waited for, at the last report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Every report says what its phase cost: on a busy machine seconds by the clock tell little."""
+    report = yield
+    now = sum(os.times()[:4])
+    report.user_properties = [*report.user_properties, (_CPU, now - _until[0])]
+    _until[0] = now
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Where the suite's time goes, by file; of a few files pytest's own durations say enough."""
+    files: dict[str, list[float]] = {}
+    reports = [report for several in terminalreporter.stats.values() for report in several]
+    for report in reports:
+        if isinstance(report, pytest.TestReport):
+            took = files.setdefault(report.nodeid.partition("::")[0], [0.0, 0.0])
+            took[0] += report.duration
+            took[1] += sum(value for name, value in report.user_properties if name == _CPU and isinstance(value, float))
+    if len(files) <= _COSTLY_FILES:
+        return
+    terminalreporter.section(f"the {_COSTLY_FILES} longest of {len(files)} files: seconds, and CPU seconds")
+    for name, (wall, cpu) in sorted(files.items(), key=lambda each: -each[1][0])[:_COSTLY_FILES]:
+        terminalreporter.write_line(f"{wall:8.0f} {cpu:8.0f}  {name}")
+    wall, cpu = (sum(took[column] for took in files.values()) for column in (0, 1))
+    terminalreporter.write_line(f"{wall:8.0f} {cpu:8.0f}  all of them")
 
 
 @pytest.fixture(scope="session", autouse=True)
