@@ -339,7 +339,7 @@ def test_slots_that_are_stepped_one_by_one_are_few_and_have_equal_turns() -> Non
         spec_of(configs.load(ROOT / f"configs/{name}_space.yaml")) for name in ("pointmass", "antgoal")
     )
     assert [together.slots_for(episodes) for episodes in (0, 1, 50, 2000)] == [0, 1, 50, 2000]
-    assert [one_by_one.slots_for(episodes) for episodes in (1, 16, 17, 50, 2000)] == [1, 16, 9, 13, 16]
+    assert [one_by_one.slots_for(episodes) for episodes in (0, 1, 16, 17, 50, 2000)] == [0, 1, 16, 9, 13, 16]
 
 
 def test_actors_are_started_where_slots_are_stepped_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:

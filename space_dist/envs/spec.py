@@ -60,7 +60,7 @@ class EnvironmentSpec:
         """Slots in which to play so many episodes soonest: equal shares, or all at once where that takes no longer."""
         if not self.one_by_one:
             return episodes
-        turns = -(-episodes // SLOTS_ONE_BY_ONE)
+        turns = max(1, -(-episodes // SLOTS_ONE_BY_ONE))
         return -(-episodes // turns)
 
     def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:

@@ -76,17 +76,18 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
     # By episode from here on, the actions of all of them included: a row is rounded by its place among the others.
     n = len(seeds)
     playing, waiting = np.arange(n_slots), n_slots  # the episode in each slot, and the next to begin
+    rows: Any = slice(None) if n_slots == n else playing  # the same; a view is sooner had than a copy
 
     def by_episode(told: NDArray[Any]) -> NDArray[Any]:
         """What every slot told, where its episode is; zeros where none has told anything."""
         if n_slots == n:
             return told
         spread = np.zeros(n, dtype=told.dtype)
-        spread[playing] = told
+        spread[rows] = told
         return spread
 
     observations = each(np.zeros_like, allocate(env.observation_space, n))
-    put(observations, playing, env.reset(playing, contexts[playing], seeds[playing]))
+    put(observations, rows, env.reset(np.arange(n_slots), contexts[rows], seeds[rows]))
     memory = Memory(acting, n)
     alive = np.arange(n) < n_slots
     returns, discounted, success = np.zeros(n), np.zeros(n), np.full(n, np.nan)
@@ -97,31 +98,31 @@ def evaluate(env: BatchedEnv, trials: Sequence[Trial]) -> list[Outcomes]:
         outputs = memory.outputs(observations)
         chosen = (acting.head.best(outputs) if noise is None
                   else acting.head.sampled(outputs, noise.at(lengths), 0, trained))  # fmt: skip
-        step = env.step(acting.head.executed(chosen)[playing])
-        rewards, ended = by_episode(step.rewards), by_episode(step.terminated | step.truncated)
+        step = env.step(acting.head.executed(chosen)[rows])
+        rewards, over = by_episode(step.rewards), step.terminated | step.truncated
         # Horner's rule for the released code's metric, sum r_t gamma^(T-1-t).
         backward = np.where(alive, gamma * backward + rewards, backward)
         returns += np.where(alive, rewards, 0.0)
         discounted += np.where(alive, discount * rewards, 0.0)
-        discount = np.where(alive, discount * gamma, discount)
+        discount *= gamma
         lengths += alive
         if step.success is not None:
             success = np.where(alive, by_episode(step.success), success)
         time += 1
-        if time >= env.horizon and (alive & ~ended & (lengths >= env.horizon)).any():
+        if time >= env.horizon and (alive & ~by_episode(over) & (lengths >= env.horizon)).any():
             raise endless(env)
-        put(observations, playing, step.observations)
-        over = np.flatnonzero(step.terminated | step.truncated)
-        free = over[alive[playing[over]]]
-        alive[playing[free]] = False
-        begun = free[: n - waiting]
-        playing[begun] = np.arange(waiting, waiting + len(begun))
-        waiting += len(begun)
-        alive[playing[begun]] = True
-        if len(over) and alive.any():  # every slot must be steppable; what follows where none begins is not counted
-            rows = playing[over]
-            put(observations, rows, env.reset(over, contexts[rows], seeds[rows]))
-            memory.forget(rows)
+        put(observations, rows, step.observations)
+        if over.any():
+            free = np.flatnonzero(over & alive[rows])
+            alive[playing[free]] = False
+            begun = free[: n - waiting]
+            playing[begun] = np.arange(waiting, waiting + len(begun))
+            waiting += len(begun)
+            alive[playing[begun]], discount[playing[begun]] = True, 1.0
+            if alive.any():  # every slot must be steppable; what follows where none begins is not counted
+                slots = np.flatnonzero(over)
+                put(observations, playing[slots], env.reset(slots, contexts[playing[slots]], seeds[playing[slots]]))
+                memory.forget(playing[slots])
     return [
         Outcomes(trial.policy.version, returns[mine], discounted[mine], lengths[mine], success[mine], backward[mine])
         for index, trial in enumerate(trials)
