@@ -88,8 +88,8 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: tuple[
 
 
 def progress(root: Path) -> int:
-    """How many files the search has written by now."""
-    return sum(1 for _ in root.rglob("*") if _.is_file())
+    """How many files the search has written by now; of folders that come and go meanwhile, some."""
+    return sum(len(files) for _, _, files in os.walk(root))
 
 
 def end_session(process: subprocess.Popen[bytes]) -> None:
