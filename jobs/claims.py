@@ -8,6 +8,7 @@ A claim whose grid was not run, or only in small, gets no verdict.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from space_dist.report.statistics import (
     start_bound,
     steps_to_threshold,
 )
-from space_dist.report.tables import interval_text, number_text
+from space_dist.report.tables import NONE, interval_text, number_text
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 PAGE: Final = ROOT / "docs/results.md"
@@ -77,9 +78,10 @@ def compared(ours: Cell, theirs: Cell, measure: Measure = "final", at: int | Non
     improvement = probability_of_improvement(np.array([*mine.values()]), np.array([*other.values()]))
     found = paired_difference(*pairs)
     when = measure if at is None else f"at {at:,} steps"
+    p = NONE if math.isnan(found.p) else f"{found.p:.2g}"
     text = (
         f"{when} {interval_text(ours.iqm(measure, at))} against {interval_text(theirs.iqm(measure, at))}, P(better) "
-        f"{interval_text(improvement, 2)}, difference {interval_text(found.mean)}, p = {found.p:.2g} ({found.n} seeds)"
+        f"{interval_text(improvement, 2)}, difference {interval_text(found.mean)}, p = {p} ({found.n} seeds)"
     )
     return Compared(improvement, found.mean, found.p, text)
 
@@ -104,6 +106,11 @@ def ratio(ours: Cell, theirs: Cell) -> Interval | None:
         for cell in (ours, theirs)
     ]
     return paired_ratio(*times) if any((one < budget).any() for one in times) else None
+
+
+def _known(found: Interval) -> bool:
+    """Whether there are seeds enough for an interval: without one nothing is seen."""
+    return found.low is not None
 
 
 def _above(found: Interval, bound: float) -> bool:
@@ -287,9 +294,10 @@ def _vds(found: Artefact) -> list[Part]:
     ours, theirs = found.cells['vds members_see=["goal_x","goal_y"]'], found.cells[ROBIN]
     ends, starts = ([returns[at] for _, returns in ours.curves.values()] for at in (-1, 0))
     gained = paired_difference(np.array(ends), np.array(starts)).mean
+    above = _above(gained, 0.0)
     return [
         worse(ours, theirs),
-        Part(f"VDS's final less its first {interval_text(gained)}", not _above(gained, 0.0), _above(gained, 0.0)),
+        Part(f"VDS's final less its first {interval_text(gained)}", _known(gained) and not above, above),
     ]
 
 

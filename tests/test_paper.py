@@ -124,13 +124,13 @@ class Kept:
         self.folder.mkdir(parents=True)
         (self.folder / "provenance.json").write_text(json.dumps({"scale": 1.0}))
 
-    def curves(self, finals: Mapping[str, float]) -> Kept:
+    def curves(self, finals: Mapping[str, float], seeds: int = 10) -> Kept:
         """From 0 to the final return of the last key that is in a label, from which seeds and cells differ a little."""
         spread = np.random.default_rng(0).normal(0.0, 0.02, (len(self.labels), 10))
         rows = [
             f"x,{quoted(label)},{seed},{steps},{share * (final_of(label, finals) + spread[i, seed])}"
             for i, label in enumerate(self.labels)
-            for seed in range(10)
+            for seed in range(seeds)
             for steps, share in (
                 (0, 0.0),
                 (200_000, 0.5),
@@ -189,6 +189,14 @@ def test_a_claim_is_judged_by_the_rules_of_the_page(
         claims.verdict(parts(claims.Artefact(tmp_path / "docs/results" / name)), whole=False)
         == "not tested at full scale"
     )
+
+
+def test_two_seeds_show_nothing(claims: Any, tmp_path: Path) -> None:
+    """Not even that something is not above its start: there is no interval."""
+    Kept(tmp_path, "ant_vds").curves({"": 10.0, "vds members_see": 3.0}, seeds=2)
+    parts = claims.CLAIMS["C11"][1](claims.Artefact(tmp_path / "docs/results/ant_vds"))
+    assert [(part.seen, part.contradicted) for part in parts] == [(False, False)] * 2
+    assert "p = — (2 seeds)" in parts[0].text
 
 
 def test_what_was_run_in_small_is_told_as_such_until_all_of_it_was_run(claims: Any, tmp_path: Path) -> None:
