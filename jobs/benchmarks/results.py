@@ -56,5 +56,8 @@ def keep(numbers: Any, file: Path | None) -> None:
 def refuse_if(exceeded: bool, console: Console) -> None:
     """End the benchmark with exit code 1 where a limit is exceeded."""
     if exceeded:
-        console.print("A limit is exceeded.", style="red")
+        console.print(
+            'A row is beyond its "at most". On a machine with other work that says little: measure again '
+            "when it is quiet.", style="red",
+        )  # fmt: skip
         raise typer.Exit(1)
