@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.results import JsonFile, keep
+from benchmarks.results import JsonFile, keep, refuse_if
 from benchmarks.servers import RayHead
 from space_dist import config as configs
 from space_dist.errors import SpaceDistError
@@ -51,9 +51,7 @@ def grid(
     console.print(table)
     console.print(f"at most {LIMIT:.0%} is wanted")
     keep({**seconds, "ratio": ratio, "limit": LIMIT}, json_file)
-    if ratio > LIMIT:
-        console.print("The limit is exceeded.", style="red")
-        raise typer.Exit(1)
+    refuse_if(ratio > LIMIT, console)
 
 
 def _submit(path: Path, root: Path, address: str, mode: str, environment: dict[str, str]) -> float:

@@ -57,7 +57,7 @@ def refuse_if(exceeded: bool, console: Console) -> None:
     """End the benchmark with exit code 1 where a limit is exceeded."""
     if exceeded:
         console.print(
-            'A row is beyond its "at most". On a machine with other work that says little: measure again '
+            '"At most" is exceeded. On a machine with other work that says little: measure again '
             "when it is quiet.", style="red",
         )  # fmt: skip
         raise typer.Exit(1)

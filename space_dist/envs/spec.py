@@ -19,7 +19,7 @@ from space_dist.envs.singles import BatchedSingles
 from space_dist.errors import ConfigError
 from space_dist.instances import ContextBounds
 
-SLOTS_ONE_BY_ONE = 16
+_SLOTS_ONE_BY_ONE = 16
 """Slots of an environment that steps them one after another, at most, where it is left to us: episodes of unequal
 length leave few of them idle at the end, and a policy's call is still shared. Decides no result."""
 
@@ -60,7 +60,7 @@ class EnvironmentSpec:
         """Slots in which to play so many episodes soonest: equal shares, or all at once where that takes no longer."""
         if not self.one_by_one:
             return episodes
-        turns = max(1, -(-episodes // SLOTS_ONE_BY_ONE))
+        turns = max(1, -(-episodes // _SLOTS_ONE_BY_ONE))
         return -(-episodes // turns)
 
     def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
