@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist.api import grids, tuning
 from space_dist.config import shipped
 from space_dist.grid import warm
 from tests.commanding import command
@@ -194,19 +195,14 @@ def in_small(data: dict[str, Any], source: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def one_supervisor() -> Iterator[None]:
-    """All grids are worked through by one process, which is started once, instead of by as many as there are cores.
+def one_server() -> Iterator[None]:
+    """All grids are worked through by forks of one process, which imports once what takes a second, and one at a time.
 
-    What it works on, every task says anew. It answers one grid's one place: never with `--max-parallel 2`.
+    What they work on, every task says anew; their environment is what it was at first.
     """
-    supervisor = warm.WarmSupervisor()
-    release, close = supervisor.release, supervisor.close
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(supervisor, "release", lambda: None)
-        patch.setattr(supervisor, "close", lambda _: None)
-        patch.setattr(supervisor, "kill", lambda: None)
-        patch.setattr(warm, "WarmSupervisor", lambda: supervisor)
+    with warm.ForkServer() as server, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, "close", lambda: None)
+        for place in (warm, grids, tuning):
+            patch.setattr(place, "ForkServer", lambda: server)
         patch.setattr("space_dist.api.grids.cores", lambda: 1)
         yield
-    release()
-    close(60.0)

@@ -8,11 +8,10 @@ import faulthandler
 import json
 import math
 import os
+import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from space_dist.experiment.status import (
 from space_dist.grid import conductor, supervisor
 from space_dist.grid.conductor import Conductor
 from space_dist.grid.planning import plan
+from space_dist.grid.warm import ForkServer
 from space_dist.ledger import METRICS, Lock, Row
 from tests.grids import ROOT, SMALL, TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE
@@ -41,24 +41,19 @@ from tests.test_report import continue_run, start_run
 
 
 class Supervised:
-    """`python -m space_dist.grid.supervisor`, spoken to as a pool does."""
+    """A supervisor, spoken to as a pool does."""
 
-    def __init__(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "space_dist.grid.supervisor"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
-        assert "ready" in self.read()
+    def __init__(self, server: ForkServer) -> None:
+        self.channel, _ = server.forked(Path(os.devnull))
+        self.words = self.channel.makefile("rb")
+        self.pid = int(self.read()["ready"])
 
     def read(self) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
+        answer: dict[str, Any] = json.loads(self.words.readline())
         return answer
 
     def send(self, message: dict[str, Any]) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(message).encode() + b"\n")
-        self.process.stdin.flush()
+        self.channel.sendall(json.dumps(message).encode() + b"\n")
 
     def attempt(self, grid: Grid, run: Run, attempt: int = 1) -> dict[str, Any]:
         (end,) = self.attempts(grid, [run], attempt)
@@ -76,12 +71,19 @@ def task(grid: Grid, runs: list[Run], attempt: int = 1) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def supervised() -> Any:
-    made = Supervised()
+def server() -> Iterator[ForkServer]:
+    with pytest.MonkeyPatch.context() as patch, ForkServer() as made:
+        patch.setenv("PYTHONPATH", str(ROOT))
+        yield made
+
+
+@pytest.fixture(scope="module")
+def supervised(server: ForkServer) -> Iterator[Supervised]:
+    made = Supervised(server)
     yield made
-    assert made.process.stdin is not None
-    made.process.stdin.close()
-    assert made.process.wait(timeout=PATIENCE) == 0
+    made.channel.shutdown(socket.SHUT_WR)
+    assert made.read() == {"code": 0}
+    assert made.words.read() == b""
 
 
 def faulty(folder: Path, fault: str, marker: str = "", **sections: Any) -> tuple[Grid, Manifest, Run]:
@@ -177,16 +179,16 @@ def test_a_stop_makes_a_checkpoint_and_the_run_goes_on(supervised: Supervised, t
     assert supervised.attempt(grid, run, 2)["cause"] is None
 
 
-def test_a_run_stops_when_its_supervisor_is_killed(tmp_path: Path) -> None:
+def test_a_run_stops_when_its_supervisor_is_killed(server: ForkServer, tmp_path: Path) -> None:
     grid, manifest, run = faulty(tmp_path, "slow")
-    lonely = Supervised()
+    lonely = Supervised(server)
     lonely.send(task(grid, [run]))
     deadline = time.monotonic() + PATIENCE
     while not grid.ledger(run).owner_alive() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert grid.ledger(run).owner_alive()
-    lonely.process.kill()
-    lonely.process.wait()
+    os.kill(lonely.pid, signal.SIGKILL)
+    assert lonely.read() == {"code": -signal.SIGKILL}
     while grid.ledger(run).owner_alive() and time.monotonic() < deadline:
         time.sleep(0.1)
     found = run_status_of(run, grid.ledger(run), manifest.retry, CODE)
@@ -237,11 +239,11 @@ class Script:
 
 
 def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nobody is left to end it but whoever waits for it; and what is merely slow to end is left in peace."""
     grid, manifest, run = faulty(tmp_path, "stop", resources={"grace_seconds": 0.5})
-    lonely, deadline = Supervised(), time.monotonic() + PATIENCE
+    lonely, deadline = Supervised(server), time.monotonic() + PATIENCE
     lonely.send(task(grid, [run]))
     stopped, attempts = None, Attempts(grid.ledger(run))
     while stopped is None or stopped.status() != psutil.STATUS_STOPPED:
@@ -249,8 +251,8 @@ def test_a_stopped_run_whose_supervisor_was_killed_holds_nobody_up(
         time.sleep(0.02)
         stopped = psutil.Process(attempts.history().process["pid"]) if attempts.history().process else None
     assert not attempts.history().abandoned
-    lonely.process.kill()
-    lonely.process.wait()
+    os.kill(lonely.pid, signal.SIGKILL)
+    assert lonely.read() == {"code": -signal.SIGKILL}
     assert attempts.history().abandoned
     assert run_status_of(run, grid.ledger(run), manifest.retry, CODE).condition == "running"
     monkeypatch.setattr("space_dist.grid.conductor._ABANDONED_SECONDS", 0.5)

@@ -81,8 +81,14 @@ def gate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def supervisors(conductor: BaseProcess) -> list[psutil.Process]:
-    return [child for child in psutil.Process(conductor.pid).children()
+def supervisors(conductor: BaseProcess | None = None) -> list[psutil.Process]:
+    """Of a conductor, by default of this process."""
+    return [child for server in servers(conductor) for child in server.children()]
+
+
+def servers(conductor: BaseProcess | None = None) -> list[psutil.Process]:
+    """The processes whose forks the supervisors of a conductor are."""
+    return [child for child in psutil.Process(conductor and conductor.pid).children()
             if "space_dist.grid.supervisor" in child.cmdline()]  # fmt: skip
 
 
@@ -134,14 +140,44 @@ def test_another_supervisor_takes_over_from_one_that_was_killed(
     assert ends(grid) == [["killed", None], [None]]
 
 
+def test_who_forks_supervisors_is_missed_by_none_of_them(
+    under_way: tuple[BaseProcess, psutil.Process, Grid], reference: list[list[Row]], gate: Path, tmp_path: Path
+) -> None:  # fmt: skip
+    conductor, supervisor, grid = under_way
+    [server] = servers(conductor)
+    kill(server)
+    gate.unlink()
+    assert rows(finished(conductor, tmp_path)) == reference
+    assert ends(grid) == [[None], [None]]
+    await_(lambda: not lives(supervisor), "its end, of which nobody is told")
+
+
+def test_an_idle_supervisor_that_was_killed_costs_no_attempt(gate: Path, tmp_path: Path) -> None:
+    gate.unlink()
+    made = plan(write(tmp_path), tmp_path / "runs")
+    first, second = made.manifest.runs()
+    found: list[tuple[Any, Ended | None]] = []
+    with LocalExecutor(made.grid, made.manifest, 1, lambda: None) as place:
+        place.start([(first, 1)])
+        await_(lambda: bool(found.extend(place.poll()) or found), "the first attempt to end")
+        [supervisor] = supervisors()
+        kill(supervisor)
+        place.start([(second, 1)])
+        await_(lambda: bool(found.extend(place.poll()) or len(found) == 2), "the second attempt to end")
+        [another] = supervisors()
+        assert another != supervisor
+    assert [ended for _, ended in found] == [Ended(None)] * 2
+    assert not lives(another)
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 75), (signal.SIGKILL, -signal.SIGKILL)])
 def test_nobody_outlives_a_conductor_that_ends_and_the_next_one_goes_on(
     under_way: tuple[BaseProcess, psutil.Process, Grid], reference: list[list[Row]], gate: Path, number: int, code: int,
     tmp_path: Path,
 ) -> None:  # fmt: skip
     conductor, supervisor, grid = under_way
-    family = [supervisor, *supervisor.children(recursive=True)]
-    assert len(family) == 2  # itself, and the run
+    family = [*servers(conductor), supervisor, *supervisor.children(recursive=True)]
+    assert len(family) == 3  # who has forked it, itself, and the run
     psutil.Process(conductor.pid).send_signal(number)
     conductor.join(PATIENCE)
     assert conductor.exitcode == code
@@ -165,9 +201,7 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
         place.start([(run, 1)])
         assert place.room() == 0
         await_(lambda: Attempts(made.grid.ledger(run)).history().begun == 1, "the attempt to begin")
-        [supervisor] = [
-            child for child in psutil.Process().children() if "space_dist.grid.supervisor" in child.cmdline()
-        ]
+        [supervisor] = supervisors()
         supervisor.suspend()
         await_(lambda: bool(found.extend(place.poll()) or found), "the attempt to end")
         gate.unlink()
@@ -215,8 +249,8 @@ def test_nobody_outlives_a_conductor_of_several_places(
     conductor, grid = start(tmp_path, at_a_time=2), Grid(tmp_path / "runs/small")
     try:
         await_(lambda: is_under_way(grid, 0) and is_under_way(grid, 1), "both runs to be under way")
-        family = [one for each in supervisors(conductor) for one in (each, *each.children(recursive=True))]
-        assert len(family) == 4  # two supervisors, each with its run
+        family = [one for each in servers(conductor) for one in (each, *each.children(recursive=True))]
+        assert len(family) == 5  # two supervisors, each with its run, and who has forked both
         psutil.Process(conductor.pid).send_signal(number)
         conductor.join(PATIENCE)
     finally:

@@ -25,7 +25,7 @@ import typer
 from space_dist.arithmetic import SETTINGS
 from tests.commanding import command
 from tests.grids import ROOT
-from tests.shell import Shell, executes, one_supervisor
+from tests.shell import Shell, executes, one_server
 
 sys.path.append(str(ROOT / "jobs"))
 
@@ -99,7 +99,7 @@ def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pyte
         codes.append(bench.command(words))
         return 0  # that so few are not shown to be equal is no fault
 
-    with one_supervisor():
+    with one_server():
         bench.block("performance.md", 3, {"/tmp/equivalence": str(bench.folder / "kept")}, answer=answer)  # noqa: S108
     told = capsys.readouterr().out
     assert "PointMass, round_robin, 4,096 steps, the same 3 seeds" in told
@@ -132,7 +132,7 @@ def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     monkeypatch.setattr(throughput, "process", lambda *_: {"kernel": 1e-6})
     sizes = {"trials": 2, "seeds": 2, "generation": 1, "steps": 2048, "rounds": 1, "n-envs": 64}
     bench.more = tuple(word for name, size in sizes.items() for word in (f"--{name}", str(size)))
-    with one_supervisor():
+    with one_server():
         bench.block("performance.md", 4)
     assert [(one["seeds"], one["evaluations"], one["processes"]) for one in studies] == [(2, [0, 2048], 1),
                                                                                          (1, [0, 2048], 1)]  # fmt: skip

@@ -23,7 +23,7 @@ from ray._private.authentication_test_utils import reset_auth_token_state
 from space_dist.experiment.manifest import Grid
 from space_dist.ledger import Ledger
 from tests.grids import ROOT
-from tests.shell import Shell, bash_blocks, executes, one_supervisor
+from tests.shell import Shell, bash_blocks, executes, one_server
 
 sys.path.append(str(ROOT / "jobs"))
 
@@ -82,7 +82,7 @@ def place(empty_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     mark, sockets = secrets.token_hex(8), Path(f"/tmp/sd{secrets.token_hex(4)}")  # noqa: S108 - must be short
     folder, served = tmp_path_factory.mktemp("clone"), tmp_path_factory.mktemp("mlflow")
     shutil.copy(empty_store, served / "mlflow.db")
-    with ray_reads_its_environment_anew(), pytest.MonkeyPatch.context() as patch, one_supervisor():
+    with ray_reads_its_environment_anew(), pytest.MonkeyPatch.context() as patch, one_server():
         for name, value in {
             MARK: mark, "HOME": str(folder / "home"), "RAY_TMPDIR": str(sockets), "RAY_AUTH_MODE": "token",
             "PYTHONPATH": str(ROOT), "RAY_USAGE_STATS_ENABLED": "0",

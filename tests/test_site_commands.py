@@ -21,7 +21,7 @@ import pytest
 from space_dist.cli import health
 from space_dist.ledger import Ledger
 from tests.own_code import blocks as code_blocks
-from tests.shell import Block, Shell, bash_blocks, executes, one_supervisor
+from tests.shell import Block, Shell, bash_blocks, executes, one_server
 from tests.test_site import ELSEWHERE, PAGES
 
 MODULES = ("test_site_commands", "test_site_cluster", "test_site_benchmarks", "test_quickstart", "test_slurm_cluster")
@@ -35,7 +35,7 @@ WITHOUT = 'pip() { echo "not done: pip $*"; }\n'
 
 @pytest.fixture(scope="module")
 def _supervised() -> Iterator[None]:
-    with one_supervisor():
+    with one_server():
         yield
 
 

@@ -27,7 +27,7 @@ from space_dist.slurm.arrays import arrays_of
 from space_dist.slurm.export import ADVANCE, JOBS, NEXT, README, SUBMIT, TRAIN, render
 from space_dist.slurm.searches import digest_of_trials, reached, runs_of_task
 from tests.commanding import command
-from tests.shell import one_supervisor
+from tests.shell import one_server
 from tests.slurm.profiles import exports
 from tests.test_racing import population_tune, racing_tune
 from tests.test_slurm import HOSTILE, MODES, Stubs, profile, short, stubs, write  # noqa: F401
@@ -343,7 +343,7 @@ def test_a_search_ends_with_the_same_bytes(
 
 @pytest.fixture
 def _one_process() -> Iterator[None]:
-    with one_supervisor():
+    with one_server():
         yield
 
 

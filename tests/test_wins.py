@@ -20,7 +20,7 @@ from space_dist.config import read_yaml
 from space_dist.experiment.manifest import load_grid
 from space_dist.grid.planning import plan
 from tests.commanding import command
-from tests.shell import Shell, bash_blocks, one_supervisor
+from tests.shell import Shell, bash_blocks, one_server
 from tests.test_paper import load_job
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -141,7 +141,7 @@ def test_the_commands_of_the_page_run(tmp_path: Path, monkeypatch: pytest.Monkey
     assert drawn.startswith("F=")
     shell = Shell(tmp_path / "clone", monkeypatch)
     sets = "configs/instances/wins/development/pointmass_uniform_"
-    with one_supervisor():
+    with one_server():
         shell.run(ours)
         shell.run(theirs, {"TRAIN.csv": f"{sets}padded.csv", "TEST.csv": f"{sets}test.csv"})
     runs = tmp_path / "clone/runs"

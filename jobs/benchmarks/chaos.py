@@ -458,7 +458,8 @@ class _Rehearsal:
         if name in ("driver", "supervisor"):
             return [driver if name == "driver" else supervisor], sharing, None
         if name == "pool worker":
-            worker = supervisor.parent()
+            forker = supervisor.parent()
+            worker = None if forker is None else forker.parent()
             if worker is None or not is_named(worker, "ray::PoolWorker"):
                 raise _Missed
             return [worker], sharing, None

@@ -13,7 +13,7 @@ from space_dist.experiment import scaling
 from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
-from space_dist.grid.warm import LocalExecutor, WarmPlaces, needs_ray
+from space_dist.grid.warm import ForkServer, LocalExecutor, needs_ray
 from space_dist.system.extras import needed_from
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import code_digest
@@ -92,7 +92,7 @@ def run_grid(
     base = workplace() / "runs" if root is None else lasting(Path(root), "root")
     named = grid.folder if isinstance(grid, Grid | GridRun) else Path(grid)
     stop = StopRequests()
-    with WarmPlaces(max_parallel) as warm, shown(progress is True) as show:
+    with ForkServer() as server, shown(progress is True) as show:
         place, manifest = frozen(named, base, scale, overrides)
 
         def observe(overview: Overview) -> None:
@@ -102,7 +102,7 @@ def run_grid(
 
         with working_on(place, manifest, wait=True, stop_requested=stop.reason, say=show):
             worked_through(
-                place, manifest, manifest.runs(), max_parallel=max_parallel, warm=warm, stop=stop, observe=observe
+                place, manifest, manifest.runs(), max_parallel=max_parallel, server=server, stop=stop, observe=observe
             )  # fmt: skip
     return GridRun(place.folder)
 
@@ -130,16 +130,16 @@ def frozen(
 def worked_through(
     place: Grid, manifest: Manifest, runs: Sequence[manifests.Run], *, stop: StopRequests,
     observe: Callable[[Overview], None], address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
-    nodes: int = 1, warm: WarmPlaces | None = None, reinstall: Callable[[], None] = lambda: None,
+    nodes: int = 1, server: ForkServer | None = None, reinstall: Callable[[], None] = lambda: None,
 ) -> list[RunStatus]:  # fmt: skip
     """Work through runs of a frozen grid; returns where they stand in the end. Arguments: as of `grid.jobs.conduct`.
 
     mode: `auto` on this machine (address local) is no Ray, unless runs have rollout actors.
-    warm: processes that were started before, for a grid on this machine.
+    server: of processes, which was started before, for a grid on this machine.
     """
     if address == "local" and mode == "auto" and not needs_ray(manifest):
         size = max(1, min(max_parallel or cores(), len(runs)))
-        with LocalExecutor(place, manifest, size, stop.reason, warm) as here:
+        with LocalExecutor(place, manifest, size, stop.reason, server) as here:
             return Conductor(place, manifest, runs, here, stop_requested=stop.reason, observe=observe).conduct()
     if address == "local":
         private_ray()

@@ -13,7 +13,7 @@ from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.experiment.tuning import find_tune
 from space_dist.grid.conductor import Overview, working_on
-from space_dist.grid.warm import WarmPlaces
+from space_dist.grid.warm import ForkServer
 from space_dist.system.extras import needed_from
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import lasting, workplace
@@ -43,7 +43,7 @@ def run_search(
     """
     base = workplace() / "runs" if root is None else lasting(Path(root), "root")
     stop = StopRequests()
-    with WarmPlaces(max_parallel) as warm, shown(progress is True) as show:
+    with ForkServer() as server, shown(progress is True) as show:
         place = planned(Path(search), base)
 
         @contextmanager
@@ -56,7 +56,7 @@ def run_search(
             yield observe
 
         with working_on(place, place.manifest(), wait=True, stop_requested=stop.reason, say=show):
-            searched_through(place, observing=observing, stop=stop, max_parallel=max_parallel, warm=warm)
+            searched_through(place, observing=observing, stop=stop, max_parallel=max_parallel, server=server)
     return GridRun(place.folder)
 
 
@@ -71,7 +71,7 @@ def planned(path: Path, root: Path) -> Grid:
 
 def searched_through(
     place: Grid, *, observing: Observing, stop: StopRequests, address: str = "local", mode: Mode = "auto",
-    max_parallel: int | None = None, nodes: int = 1, warm: WarmPlaces | None = None,
+    max_parallel: int | None = None, nodes: int = 1, server: ForkServer | None = None,
     reinstall: Callable[[], None] = lambda: None, say: Callable[[str], None] = lambda line: None,
 ) -> Manifest:  # fmt: skip
     """Work through generation after generation of a planned search; returns its manifest in the end.
@@ -90,7 +90,7 @@ def searched_through(
             with observing(manifest) as observe:
                 worked_through(
                     place, manifest, runs, stop=stop, observe=observe, address=address, mode=mode,
-                    max_parallel=max_parallel, nodes=nodes, warm=warm, reinstall=reinstall,
+                    max_parallel=max_parallel, nodes=nodes, server=server, reinstall=reinstall,
                 )  # fmt: skip
         after = advance(place, manifest)
         if after is None:  # somebody has let a failed run be tried again meanwhile

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from space_dist.experiment.manifest import Grid, Manifest, Run
     from space_dist.experiment.status import RunStatus
     from space_dist.grid.jobs import Mode, Remote
-    from space_dist.grid.warm import WarmPlaces
+    from space_dist.grid.warm import ForkServer
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
 
@@ -140,7 +140,7 @@ def grid_run(
         raise ConfigError(f"--part and --runs are of one grid, and here are {len(grids)}")
     prepare(address)
     codes = []
-    with started_ahead(address, chosen, max_parallel) as warm:
+    with started_ahead(address, chosen) as server:
         from space_dist.api.grids import frozen
 
         all_frozen = [frozen(grid, root_of(root), scale, changes or ()) for grid in grids]
@@ -155,7 +155,8 @@ def grid_run(
         if stop_file is not None:
             STOP.watch(stop_file, manifest.resources.grace_seconds)
         found = run_frozen(
-            place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part, warm=warm
+            place, manifest, address=address, mode=chosen, max_parallel=max_parallel, nodes=nodes, part=part,
+            server=server,
         )  # fmt: skip
     codes.append(tell(manifest, place, found))
     for number, (place, manifest) in enumerate(others):
@@ -385,11 +386,11 @@ def grid_work(
 
 def run_frozen(
     place: Grid, manifest: Manifest, runs: Sequence[Run] | None = None, *, address: str = "local", mode: Mode = "auto",
-    max_parallel: int | None = None, nodes: int = 1, part: str | None = None, warm: WarmPlaces | None = None,
+    max_parallel: int | None = None, nodes: int = 1, part: str | None = None, server: ForkServer | None = None,
 ) -> list[RunStatus]:  # fmt: skip
     """Work through a frozen grid, or these runs of it, with a display; returns where they stand in the end.
 
-    part: `FIRST-LAST` of them, counted from 0. warm: from `started_ahead`.
+    part: `FIRST-LAST` of them, counted from 0. server: from `started_ahead`.
     """
     prepare(address)
     from space_dist.api.grids import worked_through
@@ -403,7 +404,7 @@ def run_frozen(
         observe = stack.enter_context(display(manifest, place))
         return worked_through(
             place, manifest, chosen, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
-            warm=warm, stop=STOP, reinstall=STOP.install, observe=observe,
+            server=server, stop=STOP, reinstall=STOP.install, observe=observe,
         )  # fmt: skip
 
 
@@ -420,15 +421,15 @@ def prepare(address: str) -> None:
 
 
 @contextlib.contextmanager
-def started_ahead(address: str, mode: Mode, max_parallel: int | None) -> Iterator[WarmPlaces | None]:
-    """Processes that import what runs need while it is planned what they will do, where runs work without Ray."""
+def started_ahead(address: str, mode: Mode) -> Iterator[ForkServer | None]:
+    """Who imports what runs need while it is planned what they will do, where runs work without Ray."""
     if address != "local" or mode != "auto":
         yield None
         return
-    from space_dist.grid.warm import WarmPlaces
+    from space_dist.grid.warm import ForkServer
 
-    with WarmPlaces(max_parallel) as warm:
-        yield warm
+    with ForkServer() as server:
+        yield server
 
 
 def root_of(root: Path | None) -> Path:

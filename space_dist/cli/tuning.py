@@ -99,7 +99,7 @@ def tune_run(
     """Work through a search, generation by generation: skip what is done, go on with what is not."""
     chosen = mode_of(mode)
     prepare(address)
-    with started_ahead(address, chosen, max_parallel) as warm:
+    with started_ahead(address, chosen) as server:
         from space_dist.api.tuning import planned, searched_through
         from space_dist.grid.conductor import working_on
 
@@ -108,7 +108,7 @@ def tune_run(
         with working_on(place, place.manifest(), wait=True, stop_requested=STOP.reason, say=warn):
             manifest = searched_through(
                 place, observing=lambda manifest: display(manifest, place), stop=STOP, address=address, mode=chosen,
-                max_parallel=max_parallel, nodes=nodes, warm=warm, reinstall=STOP.install, say=say,
+                max_parallel=max_parallel, nodes=nodes, server=server, reinstall=STOP.install, say=say,
             )  # fmt: skip
     tell_outcome(place, manifest)
     say(f"`space-dist tune confirm {place.folder}` writes the grid that tells what it is worth")

@@ -29,7 +29,7 @@ from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.experiment.endings import Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.grid.supervisor import AttemptId, Task, ray_answers
-from space_dist.grid.warm import SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
+from space_dist.grid.warm import ForkServer, SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
 from space_dist.ledger import believed_alive, this_process
 
 log = logging.getLogger("space_dist")
@@ -46,7 +46,7 @@ class PoolWorker:
 
     def __init__(self, folder: str, nonce: str) -> None:
         refuse_other_folder(Path(folder), nonce)
-        self._supervisor = WarmSupervisor()
+        self._supervisor = WarmSupervisor(ForkServer())
 
     def attempt(self, task: Task) -> list[dict[str, Any]] | int | None:
         """How the attempts of a task ended; if the supervisor was lost with them, `SupervisorLostError.code`."""

@@ -5,8 +5,9 @@ with `engine: population` may share a process; each still has an attempt, and an
 of the supervisor, which has imported everything already: it starts in milliseconds, and whatever it does to itself
 (leaks, crashes, global state) ends with it.
 
-`python -m space_dist.grid.supervisor` is a warm supervisor for many runs: a task a line on standard input, the end of
-each a line on standard output. When its input ends, so does it, after its run has made a checkpoint.
+`python -m space_dist.grid.supervisor` is a server of supervisors: it imports what runs need, once, and forks one for
+each socket that comes through its standard input, which is a socket, too. A supervisor reads a task a line, and answers
+with a line how its attempts ended. When its socket ends, so does it, after its run has made a checkpoint.
 """
 
 from __future__ import annotations
@@ -392,9 +393,10 @@ def _work(grid: Grid, manifest: Manifest, runs: Sequence[Run], address: str, tel
 
 
 class _Manager:
-    """Whoever sends tasks through standard input."""
+    """Whoever sends tasks through `channel`."""
 
-    def __init__(self) -> None:
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
         self._buffer = b""
         self._asked_by: AskedBy | None = None
         self.gone = False
@@ -413,11 +415,17 @@ class _Manager:
             self._asked_by = "user"
         return self._asked_by or ("others" if self.gone else None)
 
+    def tell(self, message: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError):  # it is gone, and hears nothing
+            self._channel.sendall(json.dumps(message).encode() + b"\n")
+
     def _next(self, seconds: float | None) -> dict[str, Any] | None:
         if b"\n" not in self._buffer:
-            if self.gone or not select.select([0], [], [], seconds)[0]:
+            if self.gone or not select.select([self._channel], [], [], seconds)[0]:
                 return None
-            chunk = os.read(0, 1 << 16)
+            chunk = b""
+            with contextlib.suppress(ConnectionError):
+                chunk = self._channel.recv(1 << 16)
             self.gone = not chunk
             self._buffer += chunk
         line, newline, rest = self._buffer.partition(b"\n")
@@ -429,23 +437,69 @@ class _Manager:
 
 
 def main() -> None:
-    """Attempt every task that comes, one after another."""
+    """Fork a supervisor for each socket that comes, and say through it, once that has ended, with which exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever manages us
-    results = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print is not a result
     collect_seldom()
     preload()
     gc.freeze()  # forks look through none of it, and share its memory
-    supervisor, manager = Supervisor(), _Manager()
-    print(json.dumps({"ready": os.getpid()}), file=results, flush=True)
+    requests, wake = _socket_of(os.dup(0)), os.pipe()
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    for end in wake:
+        os.set_blocking(end, False)
+    signal.signal(signal.SIGCHLD, lambda number, frame: None)
+    signal.set_wakeup_fd(wake[1], warn_on_full_buffer=False)
+    forks: dict[int, socket.socket] = {}
+    wanted = True
+    while wanted or forks:
+        ready, _, _ = select.select([wake[0], requests.fileno()] if wanted else wake[:1], [], [])
+        if wake[0] in ready:
+            os.read(wake[0], 1 << 16)
+            _tell_ends(forks)
+        if requests.fileno() in ready:
+            _, descriptors, _, _ = socket.recv_fds(requests, 1, 1)
+            wanted = bool(descriptors)
+            for channel in map(_socket_of, descriptors):
+                if pid := os.fork():
+                    forks[pid] = channel
+                    continue
+                signal.set_wakeup_fd(-1)
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                # Whoever holds one of these would keep others from seeing that it has ended.
+                for other in (requests, *forks.values()):
+                    other.close()
+                for end in wake:
+                    os.close(end)
+                _supervise(_Manager(channel))
+                return
+
+
+def _socket_of(descriptor: int) -> socket.socket:
+    os.set_inheritable(descriptor, False)
+    return socket.socket(fileno=descriptor)
+
+
+def _tell_ends(forks: dict[int, socket.socket]) -> None:
+    """Say through their sockets which of the forks have ended, and forget them."""
+    while forks:
+        pid, status = os.waitpid(-1, os.WNOHANG)
+        if not pid:
+            return
+        with forks.pop(pid) as channel:
+            _Manager(channel).tell({"code": os.waitstatus_to_exitcode(status)})
+
+
+def _supervise(manager: _Manager) -> None:
+    """Attempt every task that comes, one after another."""
+    supervisor = Supervisor()
+    manager.tell({"ready": os.getpid()})
     for task in manager.tasks():
         _say_into(Path(task.grid))
         try:
             ended = supervisor.attempt(task, manager.stop_requested)
         except (LedgerError, ConfigError) as error:
             ended = [why_ended(Evidence(said=Said.of(error)))] * len(task.attempts)
-        ends = [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]
-        print(json.dumps({"ends": ends}), file=results, flush=True)
+        manager.tell({"ends": [{"busy": isinstance(one, Busy), **dataclasses.asdict(one)} for one in ended]})
 
 
 def preload() -> None:

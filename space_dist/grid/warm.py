@@ -1,4 +1,4 @@
-"""Supervisors in processes of their own, which keep their imports from attempt to attempt; here, they need no Ray."""
+"""Supervisors in processes of their own, all forks of one that has imported what runs need; here, they need no Ray."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import json
 import logging
 import os
 import select
+import signal
+import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -34,7 +36,6 @@ _PAUSE_SECONDS = 0.5  # before another is started where one died
 _SHARE_OF_MEMORY = 0.7  # as Ray takes it: the rest is the system's, and other people's
 _GROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of control groups, in both versions
 _CHUNK = 1 << 16
-_AHEAD = 8  # supervisors that are started before it is known how many are wanted
 
 
 class SupervisorLostError(Exception):
@@ -45,25 +46,84 @@ class SupervisorLostError(Exception):
         self.code = code
 
 
-class WarmSupervisor:
-    """`python -m space_dist.grid.supervisor` behind two pipes: started by its first task, and anew when it is lost."""
+class ForkServer:
+    """`python -m space_dist.grid.supervisor`, whose forks are supervisors: however many, they are imported for once.
+
+    Started by whoever asks first, and anew when it is lost, which costs no supervisor anything. As a context: it is
+    started, and ends with it.
+    """
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
+        self._running: tuple[subprocess.Popen[bytes], socket.socket] | None = None  # and where it is asked
+
+    def __enter__(self) -> ForkServer:
+        with contextlib.suppress(OSError):  # told by whoever cannot do without
+            self._started(None)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def forked(self, folder: Path) -> tuple[socket.socket, subprocess.Popen[bytes]]:
+        """Our end of a new supervisor's socket, and the process that forks it. folder: of the grid it is for.
+
+        The socket is at its end once supervisor and server have closed theirs; the server's last word there is the
+        supervisor's exit code. Raises OSError if no process can be started.
+        """
+        process, requests = self._started(folder)
+        ours, its = socket.socketpair()
+        # Where it has ended a moment ago, the socket is at its end.
+        with its, contextlib.suppress(BrokenPipeError):
+            socket.send_fds(requests, [b"+"], [its.fileno()])
+        return ours, process
+
+    def close(self) -> None:
+        """End it at once: its forks end by themselves."""
+        if self._running is not None:
+            process, requests = self._running
+            process.kill()
+            process.wait()
+            requests.close()
+            self._running = None
+
+    def _started(self, folder: Path | None) -> tuple[subprocess.Popen[bytes], socket.socket]:
+        """One that lives. What a new one says before it has a fork goes into this grid's folder; None: nowhere."""
+        if self._running is not None and self._running[0].poll() is None:
+            return self._running
+        self.close()
+        command = [*PYTHON, "-m", "space_dist.grid.supervisor"]
+        # Nothing of a Ray actor's own identity: runs that join Ray join it as drivers.
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
+        requests, its = socket.socketpair()
+        with its, Path(os.devnull).open("ab") if folder is None else appending(folder / SAID) as errors:
+            try:
+                process = subprocess.Popen(command, stdin=its.fileno(), stdout=errors, stderr=errors, env=environment)
+            except OSError:
+                requests.close()
+                raise
+        self._running = process, requests
+        return self._running
+
+
+class WarmSupervisor:
+    """A supervisor behind a socket: forked for its first task, and anew when it is lost."""
+
+    def __init__(self, server: ForkServer) -> None:
+        self._server = server
+        self._channel: socket.socket | None = None
+        self._forked_by: subprocess.Popen[bytes] | None = None
+        self._pid: int | None = None  # once it has said so
         self._words = b""
+        self._code: int | None = None  # of its exit
         self._stopped_since: float | None = None
 
-    def start(self, folder: Path | None = None) -> None:
-        """Have it import what runs need, where it does not run already.
-
-        folder: of the grid where what it says goes from the start, and not with its first task only.
-        """
-        if self._process is None or self._process.poll() is not None:
-            self._process, self._words = _started(folder), b""
-
     def begin(self, task: Task) -> None:
-        """Hand it attempts to make."""
-        self.start(Path(task.grid))
+        """Hand it attempts to make. Raises OSError if no process can be started for it."""
+        if self._is_gone():
+            self._channel, self._forked_by = self._server.forked(Path(task.grid))
+            self._pid, self._words, self._code, self._stopped_since = None, b"", None, None
         self._send(dataclasses.asdict(task))
 
     def ended(self, seconds: float | None = None) -> list[dict[str, Any]] | None:
@@ -71,25 +131,13 @@ class WarmSupervisor:
 
         Raises SupervisorLostError if it cannot say so any more.
         """
-        process, code = self._process, None
-        while process is not None and process.stdout is not None:
-            line, newline, rest = self._words.partition(b"\n")
-            if newline:
-                self._words = rest
-                message: dict[str, Any] = json.loads(line)
-                if "ends" in message:
-                    return list(message["ends"])
-                continue
-            if not select.select([process.stdout], [], [], seconds)[0]:
+        while (channel := self._channel) is not None:
+            if (ends := self._heard()) is not None:
+                return ends
+            if not select.select([channel], [], [], seconds)[0]:
                 return None
-            chunk = os.read(process.stdout.fileno(), _CHUNK)
-            # End of file: it is gone, and waiting reaps it.
-            if not chunk:
-                code = process.wait()
-                self._process = None
-                break
-            self._words += chunk
-        raise SupervisorLostError(code)
+            self._listen(channel)
+        raise SupervisorLostError(self._code)
 
     def stop(self) -> None:
         """Ask the live attempts to checkpoint and end."""
@@ -97,83 +145,71 @@ class WarmSupervisor:
 
     def kill_if_stopped(self) -> None:
         """Kill it if somebody has stopped it (SIGSTOP) for too long; to be called now and then."""
-        if self._process is None:
+        if self._channel is None or self._forked_by is None:
             return
         with contextlib.suppress(psutil.Error):
-            stopped = psutil.Process(self._process.pid).status() == psutil.STATUS_STOPPED
+            # Until it has said that it is there, it waits for whoever forks it.
+            process = psutil.Process(self._pid or self._forked_by.pid)
+            stopped = process.status() == psutil.STATUS_STOPPED
             self._stopped_since = (self._stopped_since or time.monotonic()) if stopped else None
             if self._stopped_since is not None and time.monotonic() - self._stopped_since > STOPPED_SECONDS:
-                self._process.kill()
+                process.kill()
 
     def release(self) -> None:
         """Have it end, after a checkpoint of whatever it still works on."""
-        if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.close()
-
-    def kill(self) -> None:
-        """End it at once: it has nothing to do."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+        if self._channel is not None:
+            with contextlib.suppress(OSError):
+                self._channel.shutdown(socket.SHUT_WR)
 
     def close(self, seconds: float) -> None:
         """Release it, and wait for its end; kill it if that takes longer than `seconds`."""
         self.release()
-        if self._process is None:
-            return
-        try:
-            self._process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        deadline = time.monotonic() + seconds
+        while (channel := self._channel) is not None:
+            if select.select([channel], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                self._listen(channel)
+                continue
+            if self._pid is not None:  # nobody else's: whoever reaps it tells us so
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(self._pid, signal.SIGKILL)
+            self._lose(channel)
+
+    def _is_gone(self) -> bool:
+        """Whether there is none: an idle one may have been killed."""
+        while (channel := self._channel) is not None and select.select([channel], [], [], 0.0)[0]:
+            self._listen(channel)
+        return self._channel is None
+
+    def _listen(self, channel: socket.socket) -> None:
+        """Read what there is; at the end of file it is gone, and so are its runs, which hold the socket, too."""
+        chunk = b""
+        with contextlib.suppress(ConnectionError):
+            chunk = channel.recv(_CHUNK)
+        self._words += chunk
+        if not chunk:
+            self._heard()
+            if self._code is None and self._forked_by is not None:  # which is gone, too, else it had told
+                self._code = self._forked_by.wait()
+            self._lose(channel)
+
+    def _lose(self, channel: socket.socket) -> None:
+        channel.close()
+        self._channel = None
+
+    def _heard(self) -> list[dict[str, Any]] | None:
+        """The ends that it has told, if it has; whatever else it has said is noted."""
+        while b"\n" in self._words:
+            line, _, self._words = self._words.partition(b"\n")
+            message: dict[str, Any] = json.loads(line)
+            if "ends" in message:
+                return list(message["ends"])
+            self._pid, self._code = message.get("ready", self._pid), message.get("code")
+        return None
 
     def _send(self, message: dict[str, Any]) -> None:
-        if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.write(json.dumps(message).encode() + b"\n")
-                self._process.stdin.flush()
-
-
-def _started(folder: Path | None) -> subprocess.Popen[bytes]:
-    command = [*PYTHON, "-m", "space_dist.grid.supervisor"]
-    # Nothing of a Ray actor's own identity: runs that join Ray join it as drivers.
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_JOB_")}
-    with Path(os.devnull).open("ab") if folder is None else appending(folder / SAID) as errors:
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
-        )  # fmt: skip
-
-
-class WarmPlaces:
-    """Supervisors of this machine that outlive what they are lent for: the next grid, or generation, starts at once.
-
-    As a context: they end with it. limit: how many are wanted at a time at most.
-    """
-
-    def __init__(self, limit: int | None = None) -> None:
-        self._idle = [WarmSupervisor() for _ in range(min(limit or cores(), cores(), _AHEAD))]
-
-    def __enter__(self) -> WarmPlaces:
-        with contextlib.suppress(OSError):  # told by whoever cannot do without
-            for supervisor in self._idle:
-                supervisor.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for supervisor in self._idle:
-            supervisor.kill()
-
-    def lent(self, count: int) -> list[WarmSupervisor]:
-        """As many as that, of which the first are warm."""
-        lent, self._idle = self._idle[:count], self._idle[count:]
-        return lent + [WarmSupervisor() for _ in range(count - len(lent))]
-
-    def take_back(self, supervisors: Iterable[WarmSupervisor]) -> None:
-        """Those that have nothing to do."""
-        self._idle.extend(supervisors)
+        if (channel := self._channel) is not None:
+            with contextlib.suppress(OSError):  # it is gone: `ended` tells
+                channel.sendall(json.dumps(message).encode() + b"\n")
 
 
 def understood(attempts: Sequence[tuple[Run, int]], ends: Sequence[dict[str, Any]]) -> list[tuple[Run, Ended | None]]:
@@ -210,17 +246,17 @@ class _Place:
 class LocalExecutor:
     """An `Executor` of `size` places here, for runs without rollout actors: there is nothing for Ray to do.
 
-    warm: who lends it supervisors, and takes those back that have nothing left to do.
+    server: of supervisors; None: one of its own, that ends with it.
     """
 
     def __init__(
         self, grid: Grid, manifest: Manifest, size: int, stop_requested: Callable[[], str | None],
-        warm: WarmPlaces | None = None,
+        server: ForkServer | None = None,
     ) -> None:  # fmt: skip
         self.size, self.memory_mb = size, memory_of_a_core() * min(1.0, cores() / size)
-        self._grid, self._stop_requested, self._warm = grid, stop_requested, warm
-        lent = [WarmSupervisor() for _ in range(size)] if warm is None else warm.lent(size)
-        self._places = [_Place(supervisor) for supervisor in lent]
+        self._grid, self._stop_requested = grid, stop_requested
+        self._own = ForkServer()  # started only if it is asked
+        self._places = [_Place(WarmSupervisor(server or self._own)) for _ in range(size)]
         self._seconds = manifest.resources.grace_seconds + KILL_SECONDS
 
     def __enter__(self) -> LocalExecutor:
@@ -229,14 +265,12 @@ class LocalExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        busy = [place for place in self._places if place.attempts or self._warm is None]
-        if self._warm is not None:
-            self._warm.take_back(place.supervisor for place in self._places if not place.attempts)
-        for place in busy:
+        for place in self._places:
             place.supervisor.release()  # all at once, and then each is waited for
         deadline = time.monotonic() + 2 * self._seconds
-        for place in busy:
+        for place in self._places:
             place.supervisor.close(max(0.0, deadline - time.monotonic()))
+        self._own.close()
 
     def room(self) -> int:
         """See `grid.Executor`."""
