@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from space_dist.config.sections import CheckpointConfig
 from space_dist.curricula import Episodes
 from space_dist.errors import SpaceDistError
 from space_dist.instances import InstanceSet
-from space_dist.ledger import Checkpoint, Ledger, decode_checkpoint, encode_checkpoint
+from space_dist.ledger import Checkpoint, Ledger, RunWriter, Status, decode_checkpoint, encode_checkpoint
 from space_dist.rollout.episodes import joined_episodes
 from space_dist.rollout.walk import Unfinished, Walk
+from space_dist.run import training
+from space_dist.run.launch import launch
 from space_dist.run.state import RunState
-from tests.test_learners import config_for, interrupted, learner_section
+from space_dist.system.interrupts import StopRequests
+from tests.test_learners import N_STEPS, config_for, interrupted, learner_section
 from tests.test_rollout import setup_for
 
 SETUP = dataclasses.replace(setup_for("tests.tiny_env:make"), shards=2, slots=3, train=setup_for().train)
@@ -143,3 +149,47 @@ def test_what_a_run_commits_is_its_state(tmp_path: Path) -> None:
     assert checkpoint.round == checkpoint.data["run"]["round"] == 3
     kinds = list(dict.fromkeys(name.split("/")[0] for name in checkpoint.arrays))
     assert kinds == ["learner", "values", "curriculum", "unfinished"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "rounds", "seconds", "cost", "due"),
+    [
+        ({}, 19, 59.0, 0.0, False),
+        ({}, 20, 1.0, 0.0, True),
+        ({}, 20, 1.0, 0.01, True),
+        ({}, 20, 1.0, 0.011, False),  # more than a hundredth
+        ({}, 1000, 59.0, 0.6, False),
+        ({}, 1, 60.0, 5.0, True),
+        ({"every_rounds": 3}, 2, 1.0, 0.0, False),
+        ({"every_rounds": 3}, 3, 1.0, 5.0, True),  # as asked, whatever it takes
+        ({"every_rounds": 3, "every_seconds": 0.5}, 1, 0.5, 0.0, True),
+    ],
+)
+def test_when_a_checkpoint_is_due(
+    settings: dict[str, Any], rounds: int, seconds: float, cost: float, due: bool
+) -> None:  # fmt: skip
+    assert CheckpointConfig(**settings).is_due(rounds, seconds, cost) == due
+
+
+@pytest.mark.parametrize(("cost", "at"), [(0.1, [20, 40, 60, 80]), (0.25, [20, 45, 70, 80]), (2.0, [20, 80])])
+def test_checkpoints_take_no_more_than_a_hundredth_of_a_run(
+    cost: float, at: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rounds of one second, by a clock of the test's own, and checkpoints that take `cost`."""
+    clock, commit, made = 0.0, RunWriter.commit, list[int]()
+
+    def slow(self: RunWriter, checkpoint: Checkpoint, status: Status) -> None:
+        nonlocal clock
+        commit(self, checkpoint, status)
+        clock += cost
+        made.append(checkpoint.round)
+
+    def round_over(_: Any) -> None:
+        nonlocal clock
+        clock += 1.0
+
+    monkeypatch.setattr(RunWriter, "commit", slow)
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock, time=time.time))
+    config = config_for(tmp_path, learner_section("ppo"), checkpoint={}, budget={"steps": 80 * N_STEPS})
+    launch(config, tmp_path / "run", resume=False, stop=StopRequests(), observe=round_over)
+    assert sorted(set(made)) == at

@@ -145,13 +145,31 @@ class EvaluationConfig(Section):
         return value
 
 
+_USUAL_ROUNDS = 20  # between checkpoints
+_WORTH = 0.01  # of a run's time
+
+
 class CheckpointConfig(Section):
     """When the run makes its progress permanent; it does so too when asked to stop. Decides no result."""
 
-    every_rounds: int = Field(default=20, ge=1)
-    """Updates between checkpoints, at most."""
+    every_rounds: int | Literal["auto"] = Field(default="auto")
+    """Updates between checkpoints, at most; auto: 20, and more where they would take more than a hundredth of the run's
+    time."""
     every_seconds: float = Field(default=60.0, gt=0.0)
     """Seconds between checkpoints, at most (and at least one update)."""
+
+    @field_validator("every_rounds")
+    @classmethod
+    def _some_rounds(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and value < 1:
+            raise ValueError("must be at least 1, or auto")
+        return value
+
+    def is_due(self, rounds: int, seconds: float, cost: float) -> bool:
+        """Whether to make one, so long after the last, whose writing took `cost` seconds."""
+        if self.every_rounds != "auto":
+            return rounds >= self.every_rounds or seconds >= self.every_seconds
+        return seconds >= self.every_seconds or (rounds >= _USUAL_ROUNDS and cost <= _WORTH * seconds)
 
 
 class Mirrors(Section):

@@ -75,7 +75,7 @@ class ForkServer:
         process, requests = self._started(folder)
         ours, its = socket.socketpair()
         # Where it has ended a moment ago, the socket is at its end.
-        with its, contextlib.suppress(BrokenPipeError):
+        with its, contextlib.suppress(ConnectionError):
             socket.send_fds(requests, [b"+"], [its.fileno()])
         return ours, process
 

@@ -139,7 +139,7 @@ class Training:
         self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
-        self._last_commit_round = 0
+        self._last_commit_round, self._commit_cost = 0, 0.0  # seconds, that the last one took to write
         self.progress = Progress(0, self._total_steps, 0.0, 0, len(setup.train))
 
     def run(self) -> None:
@@ -508,19 +508,19 @@ class Training:
         if reason is not None:
             yield from self._commit("interrupted", reason)
             raise Interrupted(f"stopped by {reason} after {self._run.steps} steps; --resume continues")
-        settings = self._config.checkpoint
-        if (
-            self._run.round - self._last_commit_round >= settings.every_rounds
-            or time.monotonic() - self._last_commit_time >= settings.every_seconds
-        ):
+        rounds, seconds = self._run.round - self._last_commit_round, time.monotonic() - self._last_commit_time
+        if self._config.checkpoint.is_due(rounds, seconds, self._commit_cost):
             yield from self._commit("running")
 
     def _commit(self, state: str, message: str | None = None) -> Work[None]:
         yield from self._settle()
         # A run is done only once its model is written.
         status = self._new_status("running" if state == "done" else state, message)
-        self._writer.commit((yield from self._save()), status)
+        asked = yield Wait([self._asked.state, self._asked.values])
+        began = time.monotonic()
+        self._writer.commit(self._save(*asked), status)
         self._last_commit_time, self._last_commit_round = time.monotonic(), self._run.round
+        self._commit_cost = self._last_commit_time - began
 
     def _new_status(self, state: Any, message: str | None = None) -> Status:
         return dataclasses.replace(
@@ -528,11 +528,11 @@ class Training:
             updated_at=time.time(), paused_at=self._pause_at if state == "paused" else 0,
         )  # fmt: skip
 
-    def _save(self) -> Work[Checkpoint]:
-        run, asked = self._run, self._asked
+    def _save(self, state: Any, values: Any) -> Checkpoint:
+        """state, values: of the curriculum, and of the instances."""
+        run = self._run
         arrays, learner = self.learner.save()
         arrays = {f"learner/{name}": array for name, array in arrays.items()}
-        state, values = yield Wait([asked.state, asked.values])
         remembered, numbers = encode_state(state)
         arrays["values"] = values
         arrays |= {f"curriculum/{name}": array for name, array in remembered.items()}
