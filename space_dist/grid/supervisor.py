@@ -457,8 +457,8 @@ def main() -> None:
             os.read(wake[0], 1 << 16)
             _tell_ends(forks)
         if requests.fileno() in ready:
-            _, descriptors, _, _ = socket.recv_fds(requests, 1, 1)
-            wanted = bool(descriptors)
+            wanted_one, descriptors, _, _ = socket.recv_fds(requests, 1, 1)
+            wanted = bool(wanted_one)  # else whoever wants them is gone
             for channel in map(_socket_of, descriptors):
                 if pid := os.fork():
                     forks[pid] = channel

@@ -35,6 +35,7 @@ _LOOK_SECONDS = 2.0  # between two looks at whether the supervisor was stopped
 _PAUSE_SECONDS = 0.5  # before another is started where one died
 _SHARE_OF_MEMORY = 0.7  # as Ray takes it: the rest is the system's, and other people's
 _GROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of control groups, in both versions
+_END_SECONDS = 5.0  # for a process that has closed its files
 _CHUNK = 1 << 16
 
 
@@ -188,8 +189,9 @@ class WarmSupervisor:
         self._words += chunk
         if not chunk:
             self._heard()
-            if self._code is None and self._forked_by is not None:  # which is gone, too, else it had told
-                self._code = self._forked_by.wait()
+            if self._code is None and self._forked_by is not None:  # which is ending, too, else it had told
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._code = self._forked_by.wait(_END_SECONDS)
             self._lose(channel)
 
     def _lose(self, channel: socket.socket) -> None:
