@@ -123,6 +123,7 @@ def test_weights_and_biases_has_a_run_once_it_rests(tmp_path: Path) -> None:
     continue_run(ledger, TEST, GROWTH)
     sync([ledger])
     (folder,) = (ledger.folder / "wandb").glob("offline-run-*")
+    assert [path.suffix for path in folder.rglob("*") if path.is_file()] == [".wandb"]  # no log that is still written
     before = contents(ledger.folder)
     sync([ledger])
     assert contents(ledger.folder) == before

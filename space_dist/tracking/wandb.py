@@ -49,6 +49,8 @@ class WeightsAndBiases:
                 shutil.rmtree(old)
             folder.mkdir(exist_ok=True)
             for made in Path(new, "wandb").glob("offline-run-*"):
+                # W&B's process still writes of its own ending there (and NFS keeps the names of open files).
+                shutil.rmtree(made / "logs", ignore_errors=True)
                 made.rename(folder / made.name)
         note_synced(folder, now)
 
@@ -58,7 +60,7 @@ class WeightsAndBiases:
         settings = wandb.Settings(
             # Nothing is sent anywhere, and nothing of this machine or its repository is recorded.
             mode="offline", console="off", silent=True, disable_git=True, disable_code=True, save_code=False,
-            x_disable_stats=True, x_disable_meta=True, x_disable_machine_info=True,
+            x_disable_stats=True, x_disable_meta=True, x_disable_machine_info=True, x_save_requirements=False,
         )  # fmt: skip
         config = {**record.params, "seed": record.tags.get("space_dist.seed", "")}
         try:
