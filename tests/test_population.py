@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from space_dist.config import RunConfig, load, read_yaml, to_yaml
 from space_dist.envs.interface import Step
 from space_dist.envs.singles import BatchedSingles
+from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, Interrupted, SpaceDistError
 from space_dist.learner import CoupledLearner
 from space_dist.ledger import CURRICULUM, Ledger
@@ -167,12 +168,50 @@ def test_members_that_draw_are_what_their_runs_are_alone(kind: str, tmp_path: Pa
         assert learned == {False, True}
 
 
-def test_members_that_stay_together_play_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    configs = [configured(tmp_path / str(number), number) for number in range(3)]
+@pytest.mark.parametrize("commits", [(20, 20, 20), (1, 2, 20)])
+def test_members_that_stay_together_play_nothing_again(
+    commits: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever of them commits, and measures, meanwhile."""
+    configs = [configured(tmp_path / str(number), number, checkpoint={"every_rounds": often, "every_seconds": 1e6},
+                          evaluation={"every_steps": (number + 1) * N_STEPS})
+               for number, often in enumerate(commits)]  # fmt: skip
     played, replayed = [], collecting.replayed
     monkeypatch.setattr(collecting, "replayed", lambda env, table: played.append(1) or replayed(env, table))
     together(configs, [tmp_path / f"run{number}" for number in range(3)])
     assert len(played) == 1  # the first round's, of nothing
+
+
+def test_members_share_no_world_of_a_simulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slots that do wait for each other at every step."""
+    monkeypatch.setattr(EnvironmentSpec, "most_slots", 4)
+    sizes: set[int] = set()
+
+    def watched(stage: Any, rollouts: Any, **how: Any) -> Any:
+        sizes.add(stage.env.n_slots)
+        return collecting.collect(stage, rollouts, **how)
+
+    monkeypatch.setattr(population, "collect", watched)
+    configs = [configured(tmp_path / str(number), number) for number in range(3)]
+    slots = configs[0].rollout.slots
+    assert isinstance(slots, int)
+    assert 3 * slots * configs[0].rollout.shards > 4 >= slots
+    expected = [alone(config, tmp_path / f"alone{number}") for number, config in enumerate(configs)]
+    folders = [tmp_path / f"run{number}" for number in range(3)]
+    assert all(isinstance(end, Outcome) for end in together(configs, folders).values())
+    assert max(sizes) <= 4
+    assert [results(folder) for folder in folders] == expected
+
+
+@pytest.mark.parametrize("slots", [2, 100])
+def test_the_memory_of_a_simulators_worlds_is_foreseen(slots: int) -> None:
+    of_ant, of_none = (
+        Blueprint.of(load(ROOT / f"configs/{name}_space.yaml", [
+            "engine=population", "learner.kind=ppo", "learner.n_steps=800", "learner.net_arch=[8]", "rollout.shards=1",
+            f"rollout.slots={slots}", "resources.workers=0"])).memory
+        for name in ("antgoal", "pointmass")
+    )  # fmt: skip
+    assert abs(of_ant - of_none - 32 * min(slots, 32)) <= 2
 
 
 def test_its_learning_is_stable_baselines3s_up_to_rounding(tmp_path: Path) -> None:

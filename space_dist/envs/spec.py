@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 
 from gymnasium import spaces
 
-from space_dist.envs import BULLET_IDS, BatchedEnv, close, make_batched, unwrapped
+from space_dist.envs import BULLET_IDS, BatchedEnv, bullet, close, make_batched, unwrapped
 from space_dist.envs.generating import EnvironmentGenerator
 from space_dist.envs.interface import Compilable, FloatArray, knows_success, opened, starts_alike
 from space_dist.envs.singles import BatchedSingles
@@ -62,6 +63,15 @@ class EnvironmentSpec:
             return episodes
         turns = max(1, -(-episodes // _SLOTS_ONE_BY_ONE))
         return -(-episodes // turns)
+
+    @property
+    def most_slots(self) -> int:
+        """Slots that an environment steps without any of them waiting for another's place in a simulator."""
+        return bullet.MAX_WORLDS if self.env_id in BULLET_IDS else sys.maxsize
+
+    def world_mb(self, n_slots: int) -> int:
+        """About what an environment of so many slots takes of the memory, beside arrays, in MB."""
+        return min(n_slots, bullet.MAX_WORLDS) * bullet.WORLD_MB if self.env_id in BULLET_IDS else 0
 
     def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
         """A new environment for as long as the context lasts."""

@@ -199,8 +199,9 @@ class Blueprint:
         if config.engine != "population" or not config.learner.can_be_stacked:
             return 0
         each = member_bytes(config.learner, spec.observation_space, spec.action_space, config.device)
+        worlds = config.rollout.shards * config.n_policies * spec.world_mb(config.rollout.slots)
         # Rounded up: 0 would mean that the run works alone.
-        return -(-config.n_policies * each >> 20)
+        return -(-config.n_policies * each >> 20) + worlds
 
     def policy_in(self, checkpoint: Checkpoint) -> Policy | Several:
         """The policy, or policies, that a checkpoint holds."""

@@ -187,11 +187,19 @@ class _Workshop:
         self._costly: set[Hashable] = set()  # batches whose environments hold more than memory
 
     def answers(self, waiting: Mapping[Path, Wait]) -> dict[Path, Any]:
-        """The values that each member waits for; an exception for one whose work failed."""
+        """The values that members wait for, of some at least; an exception for one whose work failed.
+
+        Nobody's rollout is computed before everyone who waits does for one: a member that commits by itself, or
+        measures more, is waited for, or episodes would be played again in the company that remains.
+        """
+        sooner = {
+            folder: request for folder, request in waiting.items() if not any(map(_is_collected, request.handles))
+        }
         handles = [handle for request in waiting.values() for handle in request.handles]
-        self._keep([handle for handle in handles if isinstance(handle, _Promise) and handle.value is None])
+        self._keep([handle for handle in handles if isinstance(handle, _Promise) and handle.value is None
+                    and not (sooner and _is_collected(handle))])  # fmt: skip
         answers: dict[Path, Any] = {}
-        for folder, request in waiting.items():
+        for folder, request in (sooner or waiting).items():
             values = [handle.value if isinstance(handle, _Promise) else handle for handle in request.handles]
             answers[folder] = next((value for value in values if isinstance(value, Exception)), values)
         return answers
@@ -290,9 +298,17 @@ class _Workshop:
         close(env)
 
 
+def _is_collected(handle: Handle) -> bool:
+    """Whether it is a rollout that is still to be computed."""
+    return isinstance(handle, _Promise) and handle.value is None and isinstance(handle.work, Rollout)
+
+
 def _parts(promised: Sequence[_Promise]) -> list[list[_Promise]]:
-    """Equal parts that fit the cache; each trial alone in slots that are stepped one after another."""
-    apart = promised[0].setup.spec.one_by_one and isinstance(promised[0].work, Trial)
-    count = len(promised) if apart else -(-sum(promise.slots for promise in promised) // _SLOTS)
-    split = np.array_split(np.arange(len(promised)), min(count, len(promised)))
+    """Equal parts that fit the cache, and a simulator's worlds; each trial alone where slots are stepped one by one."""
+    spec = promised[0].setup.spec
+    most = max(1, min(_SLOTS, spec.most_slots) // max(promise.slots for promise in promised))
+    if spec.one_by_one and isinstance(promised[0].work, Trial):
+        most = 1
+    count = -(-len(promised) // most)
+    split = np.array_split(np.arange(len(promised)), count)
     return [[promised[place] for place in places] for places in split]
