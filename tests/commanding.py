@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 
@@ -18,3 +20,16 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     except SystemExit as error:
         return int(error.code or 0)
     return 0
+
+
+Typed = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def typed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> subprocess.CompletedProcess[str]:
+    """`space-dist ARGUMENTS` with all that it says."""
+    capsys.readouterr()
+    code = command(monkeypatch, *arguments)
+    said = capsys.readouterr()
+    return subprocess.CompletedProcess([*map(str, arguments)], code, said.out, said.err)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 from collections.abc import Generator, Iterator
@@ -144,6 +145,15 @@ def uri(empty_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
     (tmp_path / "cwd").mkdir()
     monkeypatch.chdir(tmp_path / "cwd")
     return f"sqlite:///{store / 'mlflow.db'}"
+
+
+@pytest.fixture
+def type_in(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Any:
+    """What is typed into a terminal in `tmp_path`, behind `space-dist`; see `commanding.typed`."""
+    from tests.commanding import typed
+
+    monkeypatch.chdir(tmp_path)
+    return functools.partial(typed, monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")

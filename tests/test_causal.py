@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,8 @@ from space_dist.run.population import advance, member
 from space_dist.run.recording import recording_in
 from space_dist.run.starting import weights_in
 from space_dist.system.interrupts import StopRequests
+from tests.commanding import Typed
+from tests.shell import one_server
 from tests.test_learners import crashed, interrupted, with_checkpoints
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -385,20 +385,15 @@ def test_a_curriculum_that_needs_more_brings_it(sets: Path, tmp_path: Path) -> N
     assert forked(sets, KINDS["space"], "{kind: alp_gmm}").libraries == ("scipy", "scikit-learn")
 
 
-def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "space_dist.cli", *map(str, words)], cwd=cwd, capture_output=True,
-                          text=True, timeout=300, check=False)  # fmt: skip
-
-
-def test_the_command_writes_a_grid_of_continuations(of: Any, tmp_path: Path) -> None:
-    done = command(
+def test_the_command_writes_a_grid_of_continuations(of: Any, tmp_path: Path, type_in: Typed) -> None:
+    done = type_in(
         "fork", of("space"), "--at", AT, "--seeds", 2, "--set", "curriculum.kind=round_robin", "--set",
         "curriculum={kind: uniform}", "--set", "learner.learning_rate=0.01", "--out", tmp_path / "fork.yaml",
-        cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert f"8 runs, bit for bit the same as {of('space')} until 500 steps" in " ".join(done.stdout.split())
-    done = command("grid", "run", "fork.yaml", cwd=tmp_path)
+    with one_server():
+        done = type_in("grid", "run", "fork.yaml")
     assert done.returncode == 0, done.stderr
     [manifest] = tmp_path.glob("runs/*/manifest.json")
     cells = json.loads(manifest.read_text())["cells"]
@@ -409,15 +404,15 @@ def test_the_command_writes_a_grid_of_continuations(of: Any, tmp_path: Path) -> 
     assert len(folders) == 8
     for status in folders:
         assert rows_until(status.parent, AT) == rows_until(of("space"), AT)
-    done = command("report", manifest.parent, cwd=tmp_path)
+    done = type_in("report", manifest.parent)
     assert done.returncode == 0, done.stderr
-    again = command("fork", of("space"), "--at", AT, "--out", tmp_path / "fork.yaml", cwd=tmp_path)
+    again = type_in("fork", of("space"), "--at", AT, "--out", tmp_path / "fork.yaml")
     assert (again.returncode, "exists already" in again.stderr) == (2, True)
-    twice = command("fork", folders[0].parent, "--at", AT, cwd=tmp_path)
+    twice = type_in("fork", folders[0].parent, "--at", AT)
     assert (twice.returncode, "is itself the continuation of a run with seed 0" in " ".join(twice.stderr.split())) == (
         2, True,
     )  # fmt: skip
-    explained = command("explain", folders[0].parent, "--iteration", 1, cwd=tmp_path)
+    explained = type_in("explain", folders[0].parent, "--iteration", 1)
     assert (explained.returncode, "changes on the way" in " ".join(explained.stderr.split())) == (2, True)
 
 
@@ -432,8 +427,8 @@ def test_the_command_writes_a_grid_of_continuations(of: Any, tmp_path: Path) -> 
         (["--at", AT, "--set", "curriculum={kind: replay, of: x}"], "replay follows a run from its start"),
     ],
 )
-def test_forks_that_cannot_be_are_said(words: list[Any], said: str, of: Any, tmp_path: Path) -> None:
-    done = command("fork", of("space"), *words, "--out", tmp_path / "fork.yaml", cwd=tmp_path)
+def test_forks_that_cannot_be_are_said(words: list[Any], said: str, of: Any, tmp_path: Path, type_in: Typed) -> None:
+    done = type_in("fork", of("space"), *words, "--out", tmp_path / "fork.yaml")
     assert done.returncode == 2
     assert said in " ".join(done.stderr.split()), done.stderr
     assert "Traceback" not in done.stderr

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,8 @@ from space_dist.curricula import Draws
 from space_dist.curricula.watching import Watched, WatchedState
 from space_dist.errors import ConfigError
 from space_dist.report.headroom import evenness, in_words, measured, signal, table, verdict
-from tests.shell import bash_blocks
+from tests.commanding import Typed, command
+from tests.shell import Shell, bash_blocks, one_server
 from tests.test_rivals import feedback, instances
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -115,14 +113,9 @@ def test_what_is_watched_by_hand() -> None:
     assert (now.failed.tolist(), now.every.tolist(), now.knows_success) == ([-1.0, 1.0], [-1.0, 1.0], True)
 
 
-def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "space_dist.cli", "headroom", *map(str, words)], cwd=cwd,
-                          capture_output=True, text=True, timeout=300, check=False)  # fmt: skip
-
-
-def test_the_command_measures(tmp_path: Path) -> None:
+def test_the_command_measures(tmp_path: Path, type_in: Typed) -> None:
     asked = (SPARSE, "--seeds", 2, "--steps", 8192, "--out", tmp_path / "out")
-    done = command(*asked, "--json", cwd=tmp_path)
+    done = type_in("headroom", *asked, "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert len(found["shares"]) == 4  # updates, of 2,048 steps each
@@ -132,32 +125,33 @@ def test_the_command_measures(tmp_path: Path) -> None:
     assert sum(int(row["episodes"]) for row in rows) > 100
     assert (tmp_path / "out/headroom.png").stat().st_size > 10_000
     kept = (tmp_path / "out/instances.csv").read_bytes()
-    again = command(*asked, cwd=tmp_path)  # from what is there
+    again = type_in("headroom", *asked)  # from what is there
     assert again.returncode == 0, again.stderr
     assert " ".join(found["words"]) in " ".join(again.stdout.split())
     assert (tmp_path / "out/instances.csv").read_bytes() == kept
 
 
-def test_the_page_is_typed_from_its_first_block_to_its_last(tmp_path: Path) -> None:
+def test_the_page_is_typed_from_its_first_block_to_its_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """In small: budgets, seeds and where it forks; all else as it stands."""
-    configs_of = tmp_path / "configs"
-    (configs_of / "instances").mkdir(parents=True)
+    clone = tmp_path / "clone"
+    shell = Shell(clone, monkeypatch)
     for name in ("sparse_pointmass_round_robin", "sparse_pointmass_procurl"):
         data = yaml.safe_load((ROOT / f"configs/{name}.yaml").read_text())
         data["budget"]["steps"], data["evaluation"]["every_steps"], data["tracking"] = 8192, 8192, {"uri": None}
-        (configs_of / f"{name}.yaml").write_text(yaml.safe_dump(data))
-        for path in data["instances"].values():
-            shutil.copy(ROOT / "configs" / path, configs_of / path)
+        (clone / f"configs/{name}.yaml").write_text(yaml.safe_dump(data))
+    monkeypatch.chdir(clone)
     script = "\n".join(bash_blocks("causes.md")).replace("100000", "4096").replace("200000", "8192")
     assert script.count("space-dist ") == 6
-    ours = f'space-dist() {{ {sys.executable} -m space_dist.cli "$@"; }}\n'
-    done = subprocess.run(["bash", "-euo", "pipefail", "-c", ours + script.replace("--seeds 5", "--seeds 2")],
-                          cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert "Uniform draws gave" in done.stdout or "Nothing succeeded" in done.stdout
-    assert "6 runs, bit for bit the same" in " ".join(done.stdout.split())
-    assert (tmp_path / "runs/yoked/recorded.npz").exists()
-    assert (tmp_path / "runs/sparse_pointmass_procurl_s0_from_4096/report/report.md").exists()
+    with one_server():
+        shell.run(script, {"--seeds 5": "--seeds 2"}, answer=lambda words: command(monkeypatch, *words[1:]))
+    assert len(shell.typed) == 6
+    said = capsys.readouterr().out
+    assert "Uniform draws gave" in said or "Nothing succeeded" in said
+    assert "6 runs, bit for bit the same" in " ".join(said.split())
+    assert (clone / "runs/yoked/recorded.npz").exists()
+    assert (clone / "runs/sparse_pointmass_procurl_s0_from_4096/report/report.md").exists()
 
 
 def test_learners_without_advantages_have_outcomes(tmp_path: Path) -> None:
@@ -178,8 +172,8 @@ def test_learners_without_advantages_have_outcomes(tmp_path: Path) -> None:
         ([SPARSE, "--set", "learner.n_step=5"], "did you mean 'n_steps'"),
     ],
 )
-def test_what_cannot_be_measured_is_said(words: list[Any], said: str, tmp_path: Path) -> None:
-    done = command(*words, cwd=tmp_path)
+def test_what_cannot_be_measured_is_said(words: list[Any], said: str, tmp_path: Path, type_in: Typed) -> None:
+    done = type_in("headroom", *words)
     assert done.returncode == 2
     assert said in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
