@@ -23,7 +23,7 @@ import pytest
 from space_dist import config as configs
 from space_dist.api import grids, tuning
 from space_dist.config import shipped
-from space_dist.grid import warm
+from space_dist.grid import fork_server, warm
 from tests.commanding import command
 
 ROOT = Path(__file__).parents[1]
@@ -200,9 +200,9 @@ def one_server() -> Iterator[None]:
 
     What they work on, every task says anew; their environment is what it was at first.
     """
-    with warm.ForkServer() as server, pytest.MonkeyPatch.context() as patch:
+    with fork_server.ForkServer() as server, pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, "close", lambda: None)
-        for place in (warm, grids, tuning):
+        for place in (fork_server, warm, grids, tuning):
             patch.setattr(place, "ForkServer", lambda: server)
         patch.setattr("space_dist.api.grids.cores", lambda: 1)
         yield

@@ -29,8 +29,8 @@ from space_dist.experiment.status import (
 )
 from space_dist.grid import conductor, supervisor
 from space_dist.grid.conductor import Conductor
+from space_dist.grid.fork_server import ForkServer
 from space_dist.grid.planning import plan
-from space_dist.grid.warm import ForkServer
 from space_dist.ledger import METRICS, Lock, Row
 from tests.grids import ROOT, SMALL, TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE

@@ -13,7 +13,8 @@ from space_dist.experiment import scaling
 from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
-from space_dist.grid.warm import ForkServer, LocalExecutor, needs_ray
+from space_dist.grid.fork_server import ForkServer
+from space_dist.grid.warm import LocalExecutor, needs_ray
 from space_dist.system.extras import needed_from
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import code_digest

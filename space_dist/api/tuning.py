@@ -13,7 +13,7 @@ from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.experiment.tuning import find_tune
 from space_dist.grid.conductor import Overview, working_on
-from space_dist.grid.warm import ForkServer
+from space_dist.grid.fork_server import ForkServer
 from space_dist.system.extras import needed_from
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import lasting, workplace

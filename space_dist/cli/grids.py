@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from space_dist.experiment.manifest import Grid, Manifest, Run
     from space_dist.experiment.status import RunStatus
+    from space_dist.grid.fork_server import ForkServer
     from space_dist.grid.jobs import Mode, Remote
-    from space_dist.grid.warm import ForkServer
 
 grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x seeds.")
 
@@ -426,7 +426,7 @@ def started_ahead(address: str, mode: Mode) -> Iterator[ForkServer | None]:
     if address != "local" or mode != "auto":
         yield None
         return
-    from space_dist.grid.warm import ForkServer
+    from space_dist.grid.fork_server import ForkServer
 
     with ForkServer() as server:
         yield server

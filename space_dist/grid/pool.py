@@ -28,8 +28,9 @@ from ray.exceptions import RayActorError, RayError
 from space_dist.errors import LedgerError, SpaceDistError
 from space_dist.experiment.endings import Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
+from space_dist.grid.fork_server import ForkServer
 from space_dist.grid.supervisor import AttemptId, Task, ray_answers
-from space_dist.grid.warm import ForkServer, SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
+from space_dist.grid.warm import SupervisorLostError, WarmSupervisor, all_lost, supervisor_lost, understood
 from space_dist.ledger import believed_alive, this_process
 
 log = logging.getLogger("space_dist")

@@ -41,12 +41,12 @@ from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistEr
 from space_dist.experiment.endings import AskedBy, Busy, Ended, Evidence, Said, why_ended
 from space_dist.experiment.manifest import Grid, Manifest, Run, RunResources
 from space_dist.experiment.status import Attempts, is_done, last_lines, slurm_job
+from space_dist.grid.fork_server import SAID
 from space_dist.system.files import appending, open_own
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.processes import collect_seldom
 
 OUTPUT = "output.txt"
-SAID = "pool.log"  # by supervisors, in a grid's folder
 STOPPED_SECONDS = 10.0  # a run in state T this long is taken for lost
 _LOOK_SECONDS = 0.1
 _SIGN_SECONDS = 5.0
