@@ -16,7 +16,7 @@ import pytest
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Grid
 from space_dist.experiment.status import Attempts
-from space_dist.grid import warm
+from space_dist.grid import fork_server, warm
 from space_dist.grid.planning import plan
 from space_dist.grid.warm import LocalExecutor, memory_of_a_core, needs_ray
 from space_dist.ledger import METRICS, Row
@@ -213,7 +213,7 @@ def test_a_supervisor_that_is_stopped_for_good_is_killed(
 def test_a_supervisor_that_ends_by_itself_is_a_crash_and_says_where_to_look(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(warm, "PYTHON", (sys.executable, "-c", "raise SystemExit('nothing works here')"))
+    monkeypatch.setattr(fork_server, "PYTHON", (sys.executable, "-c", "raise SystemExit('nothing works here')"))
     made = plan(write(tmp_path), tmp_path / "runs")
     found: list[tuple[Any, Ended | None]] = []
     with LocalExecutor(made.grid, made.manifest, 1, lambda: None) as place:
