@@ -193,11 +193,11 @@ class _Workshop:
         measures more, is waited for, or episodes would be played again in the company that remains.
         """
         sooner = {
-            folder: request for folder, request in waiting.items() if not any(map(_is_collected, request.handles))
+            folder: request for folder, request in waiting.items() if not any(map(_is_to_collect, request.handles))
         }
         handles = [handle for request in waiting.values() for handle in request.handles]
         self._keep([handle for handle in handles if isinstance(handle, _Promise) and handle.value is None
-                    and not (sooner and _is_collected(handle))])  # fmt: skip
+                    and not (sooner and _is_to_collect(handle))])  # fmt: skip
         answers: dict[Path, Any] = {}
         for folder, request in (sooner or waiting).items():
             values = [handle.value if isinstance(handle, _Promise) else handle for handle in request.handles]
@@ -298,7 +298,7 @@ class _Workshop:
         close(env)
 
 
-def _is_collected(handle: Handle) -> bool:
+def _is_to_collect(handle: Handle) -> bool:
     """Whether it is a rollout that is still to be computed."""
     return isinstance(handle, _Promise) and handle.value is None and isinstance(handle.work, Rollout)
 
