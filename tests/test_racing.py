@@ -23,6 +23,7 @@ from space_dist.ledger import CURRICULUM, METRICS
 from space_dist.report.search_report import build_search_report
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
+from tests import prepared
 from tests.grids import ROOT
 from tests.patience import PATIENCE
 from tests.test_tuning_runs import end_session, progress, tiny_tune
@@ -194,21 +195,20 @@ def test_a_population_that_is_killed_ends_with_the_same_bytes(evolved: tuple[Pat
     path, undisturbed = evolved
     root, moments, killed = tmp_path / "runs", random.Random(1), 0
     for attempt in range(20):
-        command = [sys.executable, "-m", "space_dist.cli", "tune", "run", path, "--root", root,
-                   "--max-parallel", str(1 + attempt % 3)]  # fmt: skip
-        process = subprocess.Popen(command, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
+        words = ["tune", "run", path, "--root", root, "--max-parallel", 1 + attempt % 3]
+        process = prepared.command(words, tmp_path / "said.txt")
         try:
             deadline, wanted = time.monotonic() + PATIENCE, moments.randrange(10, 90) if killed < 4 else 10**9
             before = progress(root)
-            while process.poll() is None and progress(root) - before < wanted and time.monotonic() < deadline:
+            while process.is_alive() and progress(root) - before < wanted and time.monotonic() < deadline:
                 time.sleep(0.02)
-            if process.poll() is not None:
+            if process.exitcode is not None:
                 break
             killed += 1
         finally:
             end_session(process)
     assert killed >= 2
-    assert process.returncode == 0
+    assert process.exitcode == 0
     assert (root / "search/manifest.json").read_bytes() == undisturbed.manifest_file.read_bytes()
     ours = Grid(root / "search")
     for run in undisturbed.manifest().runs():

@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import random
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Mapping
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,7 +16,8 @@ import pytest
 
 from space_dist.api.tuning import run_search
 from space_dist.experiment.manifest import Grid
-from tests.grids import ROOT, TINY, write_line_instances
+from tests import prepared
+from tests.grids import TINY, write_line_instances
 from tests.patience import PATIENCE
 from tests.tunes import RATE, write_tune
 
@@ -64,16 +63,15 @@ def test_killed_at_random_moments_it_ends_with_the_same_bytes(left_alone: tuple[
     moments, killed, searches = random.Random(0), 0, 1
     for attempt in range(6 * KILLS):
         root = tmp_path / str(searches)
-        command = [sys.executable, "-m", "space_dist.cli", "tune", "run", path, "--root", root,
-                   "--max-parallel", str(1 + attempt % 3)]  # fmt: skip
-        process = subprocess.Popen(command, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
+        words = ["tune", "run", path, "--root", root, "--max-parallel", 1 + attempt % 3]
+        process = prepared.command(words, tmp_path / "said.txt")
         try:
             # From its first moments to its end, whatever the machine: by what its folder holds.
             deadline, wanted = time.monotonic() + PATIENCE, moments.randrange(1, 16) if killed < KILLS else 10**9
             before = progress(root)
-            while process.poll() is None and progress(root) - before < wanted and time.monotonic() < deadline:
+            while process.is_alive() and progress(root) - before < wanted and time.monotonic() < deadline:
                 time.sleep(0.02)
-            ended = process.poll()
+            ended = process.exitcode
         finally:
             end_session(process)
         if ended is None:
@@ -92,20 +90,19 @@ def progress(root: Path) -> int:
     return sum(len(files) for _, _, files in os.walk(root))
 
 
-def end_session(process: subprocess.Popen[bytes]) -> None:
+def end_session(process: BaseProcess) -> None:
     """End a command of ours and every process that it has started, which have sessions of their own."""
     import psutil
 
     children: list[psutil.Process] = []
     with contextlib.suppress(psutil.NoSuchProcess):
         children = psutil.Process(process.pid).children(recursive=True)
-    if process.poll() is None:
-        os.kill(process.pid, signal.SIGKILL)
+    process.kill()
     for child in children:
         with contextlib.suppress(psutil.NoSuchProcess):
             child.kill()
     psutil.wait_procs(children, timeout=PATIENCE)
-    process.wait()
+    process.join()
 
 
 def test_a_setting_that_makes_runs_fail_is_a_failed_trial(tmp_path: Path) -> None:
