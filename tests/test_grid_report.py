@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from space_dist.cli import main
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
@@ -29,6 +28,7 @@ from space_dist.report.grid import compare, heat_maps, pool, read_cells
 from space_dist.report.statistics import (
     Interval,
 )
+from tests.commanding import Typed
 from tests.grids import SMALL, write_grid
 from tests.test_report import GROWTH, continue_run, start_run
 
@@ -464,21 +464,15 @@ def test_many_cells_are_drawn_in_panels(tmp_path: Path) -> None:
 # ---- the command line -----------------------------------------------------------------------------------------------
 
 
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
-    monkeypatch.setattr("sys.argv", ["space-dist", "report", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    captured = capsys.readouterr()
-    return int(ended.value.code or 0), " ".join((captured.out + captured.err).split())
+def test_the_command_knows_a_grid(grid: Grid, tmp_path: Path, type_in: Typed) -> None:
+    def told(*words: object) -> tuple[int, str]:
+        done = type_in("report", *words)
+        return done.returncode, " ".join((done.stdout + done.stderr).split())
 
-
-def test_the_command_knows_a_grid(
-    grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     file = tmp_path / "grid.yaml"
     file.write_text("name: grid\nextends: base.yaml\nseeds: [0]\n")
     words = [file, "--root", grid.folder.parent, "--out", tmp_path / "out", "--baseline", "c", "--threshold", 3]
-    code, text = command(monkeypatch, capsys, *words)
+    code, text = told(*words)
     assert (code, "Baseline: c. Threshold of the test return: 3.000 (as asked for)." in text) == (0, True)
     assert (tmp_path / "out/report.html").exists()
     for words, complaint in (
@@ -489,9 +483,9 @@ def test_the_command_knows_a_grid(
         ([tmp_path, "--threshold", 3], "are for grids"),
         ([grid.folder, "--threshold", "nan"], "must be a finite number"),
     ):
-        code, text = command(monkeypatch, capsys, *words)
+        code, text = told(*words)
         assert (code, complaint in text) == (2, True), text
-    code, text = command(monkeypatch, capsys, file, "--root", tmp_path)
+    code, text = told(file, "--root", tmp_path)
     assert (code, "grid plan" in text) == (2, True)
 
 
