@@ -179,6 +179,12 @@ def test_a_new_project_runs_as_it_is_written(
             (mine / "grid.yaml").write_text(f"{text}set: {{ budget.steps: 2048 }}\ntracking: {{ uri: null }}\n")
             words += ["--max-parallel", "1"]
         assert command(monkeypatch, *words) == 0, (line, capsys.readouterr().err)
+    (snippet,) = re.findall(r"^In Python: `(.+?)`", page, re.MULTILINE)
+    config = (mine / "slider.yaml").read_text()
+    assert "steps: 40960" in config
+    (mine / "slider.yaml").write_text(config.replace("steps: 40960", "steps: 4096") + "tracking: { uri: null }\n")
+    exec(snippet, found := {})  # noqa: S102 - the page's own
+    assert set(found["run"].final) == {"train", "test"}
     for file in ("runs/slider_space/s0/model.npz", "report/report.png", "runs/slider/report/report.html",
                  "slurm_scripts/submit.sh", "more_instances/uniform_train.csv"):  # fmt: skip
         assert (mine / file).exists(), file
