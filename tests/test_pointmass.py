@@ -223,6 +223,18 @@ def test_what_was_flown_before_does_not_matter() -> None:
     assert fly(env, actions, seed=7, context=context) != first
 
 
+@pytest.mark.parametrize("length", [0, 1, 19, 20, 21, 60, 100])
+def test_an_episode_that_is_begun_again_has_the_noise_it_had(length: int) -> None:
+    """However much of it was drawn: an episode that goes on to the horizon draws more."""
+    actions = np.random.default_rng(5).normal(0.0, 1.0, size=(100, 2))
+    fresh = fly(gym.make(ENV_ID), actions, seed=6, context=OPEN)
+    assert len(fresh) == 101
+    env = gym.make(ENV_ID)
+    for _ in range(2):
+        assert fly(env, actions[:length], seed=6, context=OPEN) == fresh[: length + 1]
+    assert fly(env, actions, seed=6, context=OPEN) == fresh
+
+
 def test_an_unseeded_reset_goes_on_in_the_seeded_stream() -> None:
     env, actions = gym.make(ENV_ID), np.zeros((5, 2))
 

@@ -121,7 +121,7 @@ def test_a_part_of_an_evaluation_meets_the_environments_that_it_met_before(
 def test_where_parts_are_many_or_costly_one_environment_of_a_size_is_kept(
     slots: int, costly: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Seven parts over two batches, say: those of four would be dropped, each just before it is wanted."""
+    """Seven parts over two batches, say, of which four are kept: each would be dropped just before it is wanted."""
     used: list[Any] = []
     evaluated = population.evaluate
 
@@ -131,6 +131,7 @@ def test_where_parts_are_many_or_costly_one_environment_of_a_size_is_kept(
 
     monkeypatch.setattr(population, "evaluate", watched)
     monkeypatch.setattr(population, "_SLOTS", slots)
+    monkeypatch.setattr(population, "_KEPT", 4)
     if not costly:
         monkeypatch.delattr(BatchedSingles, "close")
     configs = [configured(tmp_path / str(number), 0, evaluation={"every_steps": N_STEPS}) for number in range(2)]

@@ -28,6 +28,7 @@ GOAL = np.array([0.0, -3.0])
 SUCCESS_DISTANCE = 0.25  # from the goal
 REWARD_DECAY = 0.6  # per unit of distance to the goal
 HORIZON = 100  # actions; the paper, appendix A
+_BLOCK = 20  # actions whose noise is drawn together, when the first of them comes: most episodes end long before 100
 
 BOUNDS: Final = ContextBounds(
     names=("gate_x", "gate_width", "friction"),
@@ -85,8 +86,8 @@ DISTRIBUTIONS: Final = {
 class BatchedPointMass:
     """`n_slots` point masses. Context: (gate_x, gate_width, friction).
 
-    State per slot: (x, vx, y, vy) in float64; observed as float32. An episode's noise is drawn from its seed, all
-    (horizon, inner steps, 2) numbers at once, so that it depends on nothing but the seed.
+    State per slot: (x, vx, y, vy) in float64; observed as float32. An episode's noise, (horizon, inner steps, 2), comes
+    from a generator of its own, so that it depends on nothing but its seed.
 
     With `closed_gates` gates may be as narrow as 0, which nothing gets through.
     """
@@ -105,8 +106,8 @@ class BatchedPointMass:
         self._time = np.zeros(n_slots, dtype=np.int64)
         self._seeds = np.zeros(n_slots, dtype=np.uint64)
         self._noise = np.zeros((n_slots, horizon, INNER_STEPS, 2))
-        self._drawn = np.zeros(n_slots, dtype=np.bool_)  # whether a slot's noise is that of the seed below
-        self._drawn_for = np.zeros(n_slots, dtype=np.uint64)
+        self._drawn = np.zeros(n_slots, dtype=np.int64)  # actions whose noise is known
+        self._random: dict[int, np.random.Generator] = {}  # where a slot's next noise comes from
         self._compiled: Callable[..., None] | None = None
 
     def reset(self, slots: IntArray, contexts: FloatArray, seeds: NDArray[np.uint64]) -> NDArray[np.float32]:
@@ -115,15 +116,14 @@ class BatchedPointMass:
         self._velocity[:, slots] = START[[1, 3], None]
         self._context[:, slots] = contexts.T
         self._time[slots] = 0
+        self._drawn[slots[self._seeds[slots] != seeds]] = 0  # who repeats an episode, to measure, has its noise
         self._seeds[slots] = seeds
         return self._observe()[slots]
 
     def step(self, actions: NDArray[np.generic]) -> Step:
         """Ten inner Euler steps. Crossing y = 0 outside the gate puts the mass at the wall and ends the episode."""
-        # Not in reset: who only wants start states pays for no noise; nor does who repeats an episode, to measure.
-        for slot in np.flatnonzero((self._time == 0) & ~(self._drawn & (self._drawn_for == self._seeds))):
-            np.random.default_rng(int(self._seeds[slot])).standard_normal(out=self._noise[slot])
-            self._drawn[slot], self._drawn_for[slot] = True, self._seeds[slot]
+        for slot in np.flatnonzero((self._time >= self._drawn) & (self._drawn < self.horizon)):
+            self._draw_noise(slot)
         crashed = self._advance(np.asarray(actions, dtype=np.float64))
         self._time += 1
         distance = np.hypot(self._position[0] - GOAL[0], self._position[1] - GOAL[1])
@@ -134,6 +134,15 @@ class BatchedPointMass:
             truncated=(self._time >= self.horizon) & ~crashed,
             success=distance < SUCCESS_DISTANCE,
         )
+
+    def _draw_noise(self, slot: int) -> None:
+        """The next block of it. Not in `reset`: who only wants start states pays for none."""
+        first = int(self._drawn[slot])
+        if not first:
+            self._random[slot] = np.random.default_rng(int(self._seeds[slot]))
+        block = self._noise[slot, first : first + _BLOCK]
+        self._random[slot].standard_normal(out=block)
+        self._drawn[slot] = first + len(block)
 
     def compile_physics(self) -> None:
         """Have steps computed by a compiled twin from now on, with the same bits in a fraction of the time."""

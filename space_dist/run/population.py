@@ -31,7 +31,8 @@ from space_dist.run.requests import Learn, Wait, Work
 from space_dist.system.interrupts import StopRequests
 
 _SLOTS = 1024  # environments stepped together, at most: what the cache holds of them. Decides no result
-_KEPT = 4  # batches of environments that are kept, beside those in which episodes go on
+_KEPT = 8  # batches of environments that are kept, beside those in which episodes go on: what 32 members measure in
+_KEPT_COSTLY = 4  # of those that hold more than arrays, as a simulator's worlds
 
 
 def member(config: RunConfig, folder: Path, *, stop: StopRequests, pause_at: int = 0) -> Work[Outcome]:
@@ -181,7 +182,7 @@ class _Workshop:
     """Computes what members were promised, in batches over all of them."""
 
     def __init__(self) -> None:
-        self._spare: dict[Hashable, list[BatchedEnv]] = {}  # by batch and slots; the latest used is last
+        self._spare: list[tuple[Hashable, BatchedEnv]] = []  # with batch and slots; the latest used is last
         self._stages: dict[tuple[ShardKey, ...], tuple[Hashable, Stage]] = {}  # in which these shards' episodes go on
         self._n_parts: dict[Hashable, int] = {}  # of each batch that is evaluated
         self._costly: set[Hashable] = set()  # batches whose environments hold more than memory
@@ -209,7 +210,7 @@ class _Workshop:
         for shard_keys in list(self._stages):
             self._disband(shard_keys)
         while self._spare:
-            self._drop_oldest()
+            close(self._spare.pop()[1])
 
     def _keep(self, promises: Sequence[_Promise]) -> None:
         batches: dict[Hashable, list[_Promise]] = defaultdict(list)
@@ -237,7 +238,7 @@ class _Workshop:
             values = collect(self._stage(key, promised), rollouts, length=setup.slot_length)
         else:
             env = self._env(key, promised)
-            if isinstance(unwrapped(env), Closable):
+            if _is_costly(env):
                 self._costly.add(batch)
             self._keep_spare(key, env)  # before it may fail, and is closed with the others
             values = evaluate(env, [work for work in works if isinstance(work, Trial)])
@@ -277,25 +278,24 @@ class _Workshop:
 
     def _env(self, key: Hashable, promised: Sequence[_Promise]) -> BatchedEnv:
         """A spare one, or a new one."""
-        if key not in self._spare:
-            return promised[0].setup.spec.make(sum(promise.slots for promise in promised))
-        env = self._spare[key].pop()
-        if not self._spare[key]:
-            del self._spare[key]
-        return env
+        for place in reversed(range(len(self._spare))):
+            if self._spare[place][0] == key:
+                return self._spare.pop(place)[1]
+        return promised[0].setup.spec.make(sum(promise.slots for promise in promised))
 
     def _keep_spare(self, key: Hashable, env: BatchedEnv) -> None:
-        self._spare[key] = [*self._spare.pop(key, []), env]
+        self._spare.append((key, env))
         # Members end and sizes of batches change: unbounded, every size ever met would stay in memory.
-        while sum(map(len, self._spare.values())) > _KEPT:
-            self._drop_oldest()
+        costly = [place for place, (_, spare) in enumerate(self._spare) if _is_costly(spare)]
+        if len(costly) > _KEPT_COSTLY:
+            close(self._spare.pop(costly[0])[1])
+        elif len(self._spare) > _KEPT:
+            close(self._spare.pop(0)[1])
 
-    def _drop_oldest(self) -> None:
-        key = next(iter(self._spare))
-        env = self._spare[key].pop(0)
-        if not self._spare[key]:
-            del self._spare[key]
-        close(env)
+
+def _is_costly(env: BatchedEnv) -> bool:
+    """Whether it holds more than arrays."""
+    return isinstance(unwrapped(env), Closable)
 
 
 def _is_to_collect(handle: Handle) -> bool:
