@@ -231,6 +231,10 @@ class Script:
         self.live = []
         return ended
 
+    def wait(self, seconds: float) -> None:
+        if not self.live:  # those end at the next look
+            time.sleep(seconds)
+
     def stop(self) -> None:
         pass
 
@@ -429,6 +433,10 @@ def test_what_has_begun_goes_on_before_anything_new(tmp_path: Path) -> None:
                 start_run(made.grid.ledger(run).folder)
                 continue_run(made.grid.ledger(run), [0.0, 1.0], [[0]], state="running")
             return [(run, ended)]
+
+        def wait(self, seconds: float) -> None:
+            if self.now is None:
+                time.sleep(seconds)
 
         def stop(self) -> None: ...
 

@@ -277,6 +277,22 @@ def test_a_place_is_free_again_once_its_attempt_has_ended(tmp_path: Path) -> Non
     assert {run.seed: ended for run, ended in found} == {0: Ended(None), 1: Ended(None)}
 
 
+def test_who_waits_is_told_of_an_end(tmp_path: Path) -> None:
+    made = plan(write(tmp_path), tmp_path / "runs")
+    first, second = made.manifest.runs()
+    found: list[tuple[Any, Ended | None]] = []
+    with LocalExecutor(made.grid, made.manifest, 2, lambda: None) as places:
+        places.start([(first, 1)])
+        places.start([(second, 1)])
+        until = time.monotonic() + PATIENCE
+        while len(found) < 2 and time.monotonic() < until:
+            places.wait(PATIENCE)
+            found += places.poll()
+        assert time.monotonic() < until
+        places.wait(0.0)  # for nobody
+    assert {run.seed: ended for run, ended in found} == {0: Ended(None), 1: Ended(None)}
+
+
 def test_ray_is_for_runs_with_actors(tmp_path: Path) -> None:
     assert not needs_ray(plan(write(tmp_path), tmp_path / "runs").manifest)
     assert needs_ray(plan(write(tmp_path, name="acting", resources={"workers": 1}), tmp_path / "runs").manifest)

@@ -52,6 +52,9 @@ class Idle:
     def poll(self) -> list[tuple[Run, Ended | None]]:
         return []
 
+    def wait(self, seconds: float) -> None:
+        time.sleep(seconds)
+
     def stop(self) -> None:
         pass
 

@@ -122,7 +122,7 @@ class BatchedPointMass:
 
     def step(self, actions: NDArray[np.generic]) -> Step:
         """Ten inner Euler steps. Crossing y = 0 outside the gate puts the mass at the wall and ends the episode."""
-        for slot in np.flatnonzero((self._time >= self._drawn) & (self._drawn < self.horizon)):
+        for slot in np.flatnonzero((self._time >= self._drawn) & (self._drawn < self.horizon)).tolist():
             self._draw_noise(slot)
         crashed = self._advance(np.asarray(actions, dtype=np.float64))
         self._time += 1

@@ -32,7 +32,7 @@ from space_dist.tracking.pusher import LOOK_AT, Pusher
 log = logging.getLogger("space_dist")
 
 STOP_ASKED = "the grid's file `stop`"
-_TICK_SECONDS = 0.2
+_TICK_SECONDS = 0.2  # between two looks at what nobody tells: files, and requests to stop
 _ELSEWHERE_SECONDS = 2.0  # between two looks at the files of runs that others are at
 _FIRST_DELAY, _MAX_DELAY = 0.5, 60.0  # seconds before a run that got nowhere is tried again; doubled each time
 _FINAL_PUSH_SECONDS = 300.0  # of a whole grid: its last rows and its report
@@ -88,7 +88,7 @@ def _freeze_alone(grid: Grid, manifest: Manifest, files: dict[str, bytes]) -> Ma
 
 
 class Executor(Protocol):
-    """Where runs are computed. No call blocks for longer than a moment."""
+    """Where runs are computed. No call but `wait` blocks for longer than a moment."""
 
     def room(self) -> int:
         """How many more times `start` can be called now without anything having to wait."""
@@ -109,6 +109,9 @@ class Executor(Protocol):
 
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """Attempts that have ended since, and how; None where somebody else works on the run."""
+
+    def wait(self, seconds: float) -> None:
+        """Until an attempt may have ended, but no longer than that."""
 
     def stop(self) -> None:
         """Ask every live attempt to checkpoint and end."""
@@ -167,7 +170,7 @@ class Conductor:
                     self._end_if_abandoned(run)
             self._show()
             if self._is_left():
-                time.sleep(_TICK_SECONDS)
+                self._executor.wait(_TICK_SECONDS)
         self._show()
         return self.run_statuses()
 
@@ -300,7 +303,7 @@ class Conductor:
             for run, _ in self._executor.poll():
                 self._live.pop(run.key, None)
             self._show()
-            time.sleep(_TICK_SECONDS)
+            self._executor.wait(_TICK_SECONDS)
         raise Interrupted(
             f"stopped ({reason}); what ran has made a checkpoint, and the same command goes on from there"
         )

@@ -259,6 +259,10 @@ class Jobs:
             ended += [(run, self._how(run, attempt, details)) for run, attempt in attempts]
         return ended
 
+    def wait(self, seconds: float) -> None:
+        """See `grid.Executor`: nobody tells us of a job."""
+        time.sleep(seconds)
+
     def _how(self, run: Run, attempt: int, details: JobDetails | None) -> Ended | None:
         """How a job's attempt ended: what its supervisor wrote; if it was lost, what Ray says."""
         seen = Evidence(job="") if details is None else Evidence(

@@ -173,6 +173,14 @@ class Pool:
             )
         return ended
 
+    def wait(self, seconds: float) -> None:
+        """See `grid.Executor`."""
+        awaited = [reference for slot in self._slots for reference in (slot.answer, slot.sign) if reference is not None]
+        if awaited:
+            ray.wait(awaited, timeout=seconds)
+        else:
+            time.sleep(seconds)
+
     def _listen(self, slot: _Slot) -> None:
         """Ask for a sign of life now and then; whoever gives none for too long is killed, and found dead next time."""
         now = time.monotonic()

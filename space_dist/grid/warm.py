@@ -59,6 +59,11 @@ class WarmSupervisor:
         self._code: int | None = None  # of its exit
         self._stopped_since: float | None = None
 
+    @property
+    def channel(self) -> socket.socket | None:
+        """What becomes readable when it says something, or is gone; None where it is known to be."""
+        return self._channel
+
     def begin(self, task: Task) -> None:
         """Hand it attempts to make. Raises OSError if no process can be started for it."""
         if self._is_gone():
@@ -242,6 +247,11 @@ class LocalExecutor:
     def poll(self) -> list[tuple[Run, Ended | None]]:
         """See `grid.Executor`."""
         return [end for place in self._places if place.attempts for end in self._ended(place)]
+
+    def wait(self, seconds: float) -> None:
+        """See `grid.Executor`."""
+        channels = [place.supervisor.channel for place in self._places if place.attempts]
+        select.select([channel for channel in channels if channel is not None], [], [], seconds)
 
     def _ended(self, place: _Place) -> list[tuple[Run, Ended | None]]:
         try:
