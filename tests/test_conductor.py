@@ -18,7 +18,7 @@ from typing import Any
 import psutil
 import pytest
 
-from space_dist.errors import ConfigError, Interrupted
+from space_dist.errors import ConfigError, Interrupted, LedgerError
 from space_dist.experiment.endings import Busy, Cause, Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import (
@@ -28,7 +28,7 @@ from space_dist.experiment.status import (
     settled,
 )
 from space_dist.grid import conductor, supervisor
-from space_dist.grid.conductor import Conductor
+from space_dist.grid.conductor import Conductor, Overview
 from space_dist.grid.fork_server import ForkServer
 from space_dist.grid.planning import plan
 from space_dist.ledger import METRICS, Lock, Row
@@ -454,6 +454,43 @@ def test_runs_that_can_share_a_process_are_dealt_evenly_to_all_places(tmp_path: 
     Conductor(made.grid, made.manifest, made.manifest.runs(), script, stop_requested=lambda: None).conduct()
     assert [len(group) for group in script.groups] == [3, 3, 1]
     assert script.groups[2] == [made.manifest.runs()[0].key]
+
+
+@pytest.mark.parametrize("begins", [False, True])
+def test_a_run_whose_end_cannot_be_written_is_not_tried_for_ever(tmp_path: Path, *, begins: bool) -> None:
+    """As on a full disk: its history stays what it was, or says that it has begun, by somebody who lives."""
+    made = plan(write_grid(tmp_path, seeds=[0, 1]), tmp_path / "runs")
+    runs = made.manifest.runs()
+    Attempts(made.grid.ledger(runs[0])).begin(1, {})
+    Attempts(made.grid.ledger(runs[0])).end(1, Ended(Cause.PREEMPTED, "before"))
+    tried: list[Run] = []
+
+    class Unwritable(Script):
+        unwritable: Sequence[Run] = ()
+
+        def start(self, attempts: Sequence[tuple[Run, int]]) -> None:
+            [(run, attempt)] = attempts
+            tried.append(run)
+            if run is not runs[0]:
+                super().start(attempts)
+                return
+            if begins:
+                Attempts(made.grid.ledger(run)).begin(attempt, {})
+            self.unwritable = (run,)
+
+        def poll(self) -> list[tuple[Run, Ended | None]]:
+            told, self.unwritable = self.unwritable, ()
+            return [*super().poll(), *((run, Ended(Cause.CRASH, "cannot write attempts.jsonl")) for run in told)]
+
+    seen: list[Overview] = []
+    executor = Unwritable(made.grid, {}, size=1)
+    works = Conductor(made.grid, made.manifest, runs, executor, stop_requested=lambda: None,
+                      observe=lambda now: seen.append(dataclasses.replace(now)))  # fmt: skip
+    words = rf"1 of {len(runs)} runs could not be worked on: cannot write attempts.jsonl\. What is done stays done"
+    with pytest.raises(LedgerError, match=words):
+        works.conduct()
+    assert tried == runs
+    assert (seen[-1].done, seen[-1].failed) == (len(runs) - 1, 1)
 
 
 @pytest.mark.parametrize(("n_seeds", "groups"), [(5, [3, 3, 3, 1]), (4, [4, 4]), (8, [4, 4, 4, 4]), (9, [3] * 6)])

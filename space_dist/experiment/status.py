@@ -42,6 +42,10 @@ class History:
     where: Mapping[str, Any] = field(default_factory=dict)
     process: Mapping[str, Any] = field(default_factory=dict)
 
+    def tells_end_of(self, attempt: int) -> bool:
+        """Whether that attempt is on record, and the end of the last one."""
+        return self.begun >= attempt and self.last is not None
+
     @property
     def abandoned(self) -> bool:
         """Whether its process lives here, and the supervisor does not that would end it."""

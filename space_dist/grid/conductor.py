@@ -23,7 +23,16 @@ from typing import Protocol
 from space_dist.errors import ConfigError, Interrupted, LedgerError, RunLockedError
 from space_dist.experiment.endings import Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.experiment.status import Attempts, RunStatus, concluded, may_retry, run_status_of, run_statuses, unheard
+from space_dist.experiment.status import (
+    Attempts,
+    RunStatus,
+    concluded,
+    is_done,
+    may_retry,
+    run_status_of,
+    run_statuses,
+    unheard,
+)
 from space_dist.ledger import Lock
 from space_dist.system.files import in_words, locked
 from space_dist.system.provenance import code_digest
@@ -147,6 +156,8 @@ class Conductor:
         self._interrupted: list[tuple[float, Run]] = []
         self._fresh: list[tuple[float, Run]] = []
         self._live: dict[str, Run] = {}
+        self._attempt: dict[str, int] = {}  # of those that were started here
+        self._unrecorded: dict[str, str] = {}  # runs whose end could not be written, and why
         self._steps: dict[str, int] = {}  # that it had taken by then
         self._elsewhere: dict[str, Run] = {}
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
@@ -154,7 +165,11 @@ class Conductor:
         self._overview = Overview(len(runs), sum(run.cell.steps_to_take for run in runs))
 
     def conduct(self) -> list[RunStatus]:
-        """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop."""
+        """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop.
+
+        Raises LedgerError in the end if runs have left no record of how they ended: nobody would know of it, and they
+        would be tried for ever.
+        """
         self._begin()
         looked = time.monotonic()
         while self._is_left():
@@ -172,6 +187,12 @@ class Conductor:
             if self._is_left():
                 self._executor.wait(_TICK_SECONDS)
         self._show()
+        if self._unrecorded:
+            raise LedgerError(
+                f"{len(self._unrecorded)} of {len(self._runs)} runs could not be worked on: "
+                f"{next(iter(self._unrecorded.values()))}. What is done stays done; once that can be written, the same "
+                "command goes on"
+            )
         return self.run_statuses()
 
     def _is_left(self) -> bool:
@@ -230,8 +251,10 @@ class Conductor:
             keys = {run.key for run in chosen}
             self._interrupted = [entry for entry in self._interrupted if entry[1].key not in keys]
             self._fresh = [entry for entry in self._fresh if entry[1].key not in keys]
-            self._executor.start([(run, self._next_attempt(run)) for run in chosen])
+            attempts = [(run, self._next_attempt(run)) for run in chosen]
+            self._executor.start(attempts)
             self._live |= {run.key: run for run in chosen}
+            self._attempt |= {run.key: attempt for run, attempt in attempts}
 
     def _next(self) -> list[Run]:
         """The runs to be started next, in one process: one, or an equal share of those that can share a process."""
@@ -269,6 +292,7 @@ class Conductor:
 
     def _settle(self, run: Run, ended: Ended | None) -> None:
         self._live.pop(run.key, None)
+        attempt, ledger = self._attempt.pop(run.key, 0), self._grid.ledger(run)
         if ended is None:
             self._elsewhere[run.key] = run
             return
@@ -276,7 +300,14 @@ class Conductor:
             self._note_done(run)
             log.info("%s: done", run.title)
             return
-        history = Attempts(self._grid.ledger(run)).history()
+        history = Attempts(ledger).history()
+        if not history.tells_end_of(attempt) and not is_done(run, ledger):
+            log.warning("%s: %s, and no record of it: %s", run.title, ended.cause.in_words, ended.detail)
+            self._overview.message = f"{run.title}: {ended.detail}"
+            self._overview.failed += 1
+            self._overview.steps_left -= run.cell.steps_to_take
+            self._unrecorded[run.key] = ended.detail
+            return
         again = may_retry(ended.cause, history.ends, self._manifest.retry)
         log.warning("%s: %s%s: %s", run.title, ended.cause.in_words, ", trying again" if again else "", ended.detail)
         self._overview.message = f"{run.title}: {ended.cause.in_words}"
