@@ -156,6 +156,18 @@ class Mine(PPO):
     assert "extra_state()" in said
 
 
+def test_a_run_that_failed_before_its_first_round_holds_nobody_up(example: Path) -> None:
+    """As by a wrong argument: nothing is lost if the config that was put right takes its folder."""
+    right, run = chosen("learner.kwargs={target: 3.0}"), example / "run"
+    with pytest.raises(SpaceDistError, match="cannot be made of"):
+        launch(chosen("learner.kwargs={targte: 3.0}"), run, resume=False, stop=StopRequests())
+    assert Ledger(run).status().state == "failed"
+    launch(right, run, resume=False, stop=StopRequests())
+    assert results(run) == trained(example / "alone", "learner.kwargs={target: 3.0}")
+    with pytest.raises(SpaceDistError, match="already holds a run"):
+        launch(right, run, resume=False, stop=StopRequests())
+
+
 HOOKS = "class Mine(PPO):\n    def train(self):\n        super().train()\n"
 
 

@@ -199,7 +199,7 @@ def _begun(
     # Whatever the config cannot do is refused before the folder is written to.
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
-    if ledger.exists() and not resume:
+    if ledger.exists() and not resume and not _is_stillborn(ledger):
         raise ConfigError(
             f"{folder} already holds a run: --resume continues it, --out DIR starts another (from Python: resume=True, "
             "out=DIR)"
@@ -246,8 +246,10 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
         started_at=now, updated_at=now, fingerprint=here,
         identity=configs.identity(config, setup.train.digest(), setup.test.digest(), given=given),
     )  # fmt: skip
-    before = writer.status = _status_before(ledger)
-    earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
+    before, earlier = None, None
+    if not _is_stillborn(ledger):
+        before = writer.status = _status_before(ledger)
+        earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
     if before is not None:
         if before.has_reached(pause_at) and earlier is None:
             damage = ledger.damage()
@@ -300,6 +302,17 @@ def arithmetic_digest() -> str:
     """`arithmetic.digest` of all that a run computes with: it is what bits depend on, instead of the CPU's name."""
     checks = (arithmetic.numpy_checks(), arithmetic.scipy_checks(), torch_checks())
     return arithmetic.digest(itertools.chain(*checks))
+
+
+def _is_stillborn(ledger: Ledger) -> bool:
+    """Whether a run failed there before it had committed anything, as by a wrong argument of its learner.
+
+    Nothing is lost if one of another config takes its place.
+    """
+    with contextlib.suppress(LedgerError):
+        status = ledger.status()
+        return status.state == "failed" and status.checkpoint is None and not ledger.checkpoint_files()
+    return False
 
 
 def _status_before(ledger: Ledger) -> Status | None:
