@@ -21,7 +21,9 @@ from hypothesis import strategies as st
 
 from space_dist import cli
 from space_dist.cli import runs, terminal
+from space_dist.config import RunConfig, reading
 from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.slurm.profile import Profile
 from space_dist.system.interrupts import StopRequests
 from tests import prepared
 from tests.patience import PATIENCE
@@ -97,6 +99,8 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (train(f"instances.train={TEST}"), ["overlap", "id 100"]),
         (train("tracking.uri=mysql://x"), ["tracking.uri", "sqlite:////absolute/path/mlflow.db"]),
         (["train", CONFIG, "--workers", "many"], ["--workers"]),
+        (["train", CONFIG, "--workers", "-1"], ["space-dist: --workers -1: resources.workers: "]),
+        (["train", CONFIG, "--seed", "-1"], ["space-dist: --seed -1: seed: -1: Input should be"]),
         (["train", CONFIG, "--no-such-option"], ["no-such-option"]),
         (["no-such-command"], ["no-such-command"]),
         (["instances", "sample", "pointmass_unifrom", "--out", "x"], ["did you mean 'pointmass_uniform'?"]),
@@ -408,9 +412,17 @@ def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:
     assert "Traceback" not in ended.stderr
 
 
-def test_evaluate_without_a_run_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_evaluate_without_a_run_is_an_error(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code, _, error = run(capsys, "evaluate", tmp_path, "--instances", TEST)
     assert (code, "holds no run" in error) == (1, True)
+    (tmp_path / "my_run").mkdir()
+    monkeypatch.chdir(tmp_path)
+    more = {"evaluate": ("--instances", TEST), "explain": ("--iteration", 1), "export-sb3": (), "fork": ("--at", 1)}
+    for command, options in {**more, "render": ("--out", "there")}.items():
+        code, _, error = run(capsys, command, "my_rn", *options)
+        assert (code, "my_rn does not exist; did you mean 'my_run'?" in error.replace("\n", "")) == (1, True)
 
 
 def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -461,6 +473,22 @@ def test_a_grid_is_told_from_a_run(capsys: pytest.CaptureFixture[str]) -> None:
     code, _, said = run(capsys, "grid", "run", CONFIG)
     assert code == 2
     assert said.startswith(f"space-dist: {CONFIG} is the config of one run: space-dist train {CONFIG}")
+    code, _, said = run(capsys, "config", "check", grid)
+    assert (code, said) == (2, f"space-dist: {grid} is a grid, of many runs: space-dist grid plan {grid}\n")
+    search = ROOT / "configs/tune/pointmass.yaml"
+    code, _, said = run(capsys, "config", "check", search)
+    assert (code, said) == (2, f"space-dist: {search} is a search, of many runs: space-dist tune plan {search}\n")
+
+
+def test_a_slurm_profile_is_told_from_a_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("env: {OMP_NUM_THREADS: '1'}\nvenv: /opt/venv\n")
+    for profile in (ROOT / "configs/slurm/site.yaml", Path("shipped:slurm/site"), own):
+        told = f"space-dist: {profile} is a SLURM profile: space-dist slurm export GRID --out DIR --profile {profile}\n"
+        for command in (["train"], ["config", "check"]):
+            code, _, said = run(capsys, *command, profile)
+            assert (code, said) == (2, told)
+    assert Profile.model_fields.keys() - RunConfig.model_fields.keys() == reading._OF_PROFILES
 
 
 def test_the_schema_can_be_asked_for_a_part(capsys: pytest.CaptureFixture[str]) -> None:
@@ -477,6 +505,12 @@ def test_the_schema_can_be_asked_for_a_part(capsys: pytest.CaptureFixture[str]) 
     assert len(kind) < len(whole) / 10
     code, _, said = run(capsys, "config", "schema", "gamm_")
     assert (code, said) == (2, "space-dist: config schema: no key has 'gamm_' in it; did you mean 'gamma'?\n")
+    code, _, said = run(capsys, "config", "schema", "lr")
+    assert (code, said) == (
+        2,
+        "space-dist: config schema: no key has 'lr' in it. What Stable-Baselines3 calls lr is learner.learning_rate "
+        "here\n",
+    )
 
 
 def test_the_keys_of_grids_and_searches_are_explained(capsys: pytest.CaptureFixture[str]) -> None:

@@ -188,7 +188,9 @@ def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> No
         (lambda: ppo(line_env(), policy_kwargs={"activation_fn": torch.nn.ELU}), {"kind": "vds"},
          "knows Tanh and ReLU, not ELU"),
         (lambda: ppo(line_env()), {"aggregate": "population"}, "trains several policies"),
-        (lambda: ppo(line_env()), {"kind": "plr", "robust": True}, "model.learn learns from every one"),
+        *((lambda: ppo(line_env()), settings,
+           "model.learn learns from every one: train with space-dist, or set robust: false$")
+          for settings in ({"kind": "plr", "robust": True}, {"kind": "accel"})),
         (lambda: ppo(ContextVecEnv("tests.test_every_curriculum:make_silent", TARGETS, SLOTS)),
          {"kind": "learning_progress"}, "learning_progress needs to know whether an episode succeeded"),
         (lambda: ppo(line_env()), {"kind": "manual", "column": "difficulty"}, "without a column 'difficulty'"),

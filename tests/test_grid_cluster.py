@@ -184,11 +184,11 @@ def test_a_job_server_that_wants_another_token_is_one_clear_sentence(
     from space_dist.grid import jobs
 
     def refuse(_: str) -> None:
-        raise AuthenticationError("Invalid authentication token")
+        raise AuthenticationError("Invalid authentication token.. Ensure that it is available in a local file")
 
     monkeypatch.setattr(jobs, "JobSubmissionClient", refuse)
     manifest = plan(write_grid(tmp_path), tmp_path / "runs").manifest
-    with pytest.raises(SpaceDistError, match=r"lets nobody in .*RAY_AUTH_MODE=token.*\(Invalid authentication token"):
+    with pytest.raises(SpaceDistError, match=r"lets nobody in .*=token.*\(Invalid authentication token\)$"):
         jobs.Remote("http://127.0.0.1:9", manifest, tmp_path / "runs")
 
 

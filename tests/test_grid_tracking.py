@@ -455,6 +455,10 @@ def test_the_command_takes_a_grid_by_each_of_its_names(uri: str, tmp_path: Path)
         assert done.exit_code == 0, done.output
         answers.append(done.output)
     assert "1 new, 3 rows pushed" in answers[0]
+    assert answers[0].splitlines()[:3] == [
+        f"mirroring {grid.folder} to MLflow at {uri}", f"{grid.folder}: to MLflow at {uri}",
+        f"demo: {grid.manifest().runs()[0].title}",
+    ]  # fmt: skip
     by_name = CliRunner().invoke(app, ["sync", "--uri", uri, "demo", "--root", str(tmp_path / "runs")])
     answers.append(by_name.output)
     assert all("1 runs are up to date in MLflow (0 new, 0 rows pushed" in answer for answer in answers[1:])

@@ -193,6 +193,29 @@ def test_what_a_users_module_has_imported_from_a_library_is_no_function_of_its()
     assert load(f"{__name__}:nothing", "env.id") is None
 
 
+def test_a_module_that_is_not_found_is_told_with_the_nearest_of_the_current_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "own_worlds").mkdir()
+    for file in ("own_lander.py", "own_worlds/__init__.py", "own_worlds/first.py"):
+        (tmp_path / file).write_text("Lander = object\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for asked, told in (
+        ("own_landr:Lander", "No module named 'own_landr'; did you mean 'own_lander'? It was looked for where"),
+        ("own_world.first:Lander", "No module named 'own_world'; did you mean 'own_worlds'? It was looked for where"),
+        ("quite_another:Lander", "No module named 'quite_another'. It was looked for where"),
+        ("own_lander.py:Lander", "'own_lander.py:Lander': leave out `.py`: own_lander:Lander"),
+        ("./own_lander.py:Lander", "leave out `.py`: own_lander:Lander"),
+        ("own_worlds/first.py:Lander", "leave out `.py`: own_worlds.first:Lander"),
+        (f"{tmp_path}/own_lander.py:Lander", "leave out `.py`: own_lander:Lander"),
+        ("../there.py:Lander", "leave out `.py`: there:Lander, and start in .."),
+    ):
+        with pytest.raises(ConfigError) as refusal:
+            load(asked, "env.id")
+        assert told in str(refusal.value)
+
+
 def test_of_carls_modules_only_environments_are_named(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     assert command(monkeypatch, "env", "check", "carl.envs.gymnasium:import_module") == 2
     assert "Traceback" not in capsys.readouterr().err

@@ -198,9 +198,9 @@ def test_a_folder_that_holds_something_is_left_alone(
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    for name in ("full", "file"):
+    for name, why in (("full", "is not empty"), ("file", "is a file")):
         assert command(monkeypatch, "init", tmp_path / name) == 2
-        assert f"{tmp_path / name} is not empty" in capsys.readouterr().err
+        assert f"{tmp_path / name} {why}; a project" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
 
 

@@ -83,8 +83,11 @@ def test_a_longer_run_is_the_one_that_had_its_budget_from_the_start(
     space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
     space_dist.train(long, out=tmp_path / "whole", progress=False)
     assert files(tmp_path / "run") == files(tmp_path / "whole")
-    with pytest.raises(ConfigError, match=r"another configuration \(budget.steps: 440 -> 240\)"):
+    with pytest.raises(ConfigError, match=r"budget.steps: 440 -> 240: the budget of a run that is there may only grow"):
         space_dist.train(short, out=tmp_path / "run", resume=True, progress=False)
+    fewer = long.model_copy(update={"budget": long.budget.model_copy(update={"episodes": 5})})
+    with pytest.raises(ConfigError, match=r"budget.episodes: no limit -> 5: the budget of a run"):
+        space_dist.train(fewer, out=tmp_path / "run", resume=True, progress=False)
 
 
 def test_a_run_shorter_than_its_first_checkpoint_begins_anew(tmp_path: Path) -> None:
@@ -239,7 +242,7 @@ def test_train_does_what_the_command_does(tmp_path: Path, monkeypatch: pytest.Mo
     assert files(tmp_path / "told") == files(run.folder)
     assert run.final["test"] == run.evaluations[-1]["test"]["return"]
     assert isinstance(run.config, RunConfig)
-    with pytest.raises(LedgerError, match="holds no run"):
+    with pytest.raises(LedgerError, match="does not exist"):
         space_dist.Run(tmp_path / "nowhere")
     with pytest.raises(LedgerError, match=r"runs below it: space_dist\.report_on\(.*Run\(.*/called'\) is one"):
         space_dist.Run(tmp_path)
@@ -252,6 +255,9 @@ def test_a_grids_folder_is_no_run_and_says_what_reads_it(tmp_path: Path) -> None
     folder = plan_search(write_tune(tmp_path, name="sought"), tmp_path / "runs").grid.folder
     with pytest.raises(LedgerError, match=r"a search's: `space-dist tune report "):
         space_dist.Run(folder)
+    for read in (space_dist.Run, space_dist.load_policy):
+        with pytest.raises(LedgerError, match=r"/soght does not exist; did you mean 'sought'\?"):
+            read(folder.with_name("soght"))
     (tmp_path / "manifest.json").write_text("{}")  # somebody else's
     with pytest.raises(LedgerError, match="holds no run"):
         space_dist.Run(tmp_path)
@@ -263,7 +269,7 @@ def test_a_run_with_a_dashboard_ends_with_where_to_look(
     """The mirror's own process is stood in for by what it writes: the quickstart's test has a whole one."""
 
     def start(pusher: Pusher, tracking: Mirrors, folder: Path, log_file: Path) -> None:
-        said = "1 runs are up to date in MLflow\\nLook at http://x/#/experiments/1 once\\n"
+        said = 2 * "1 runs are up to date in MLflow\\nLook at http://x/#/experiments/1 once\\n"  # a lost one's, too
         pusher._where, pusher._folder, pusher._log_file = str(tracking.uri), folder, log_file
         pusher._said_before = log_file.write_text("Look at an older page\n")
         pusher._process = subprocess.Popen(["/bin/sh", "-c", f"printf '{said}' >> {shlex.quote(str(log_file))}"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,13 +13,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from space_dist.cli.runs import print_report
 from space_dist.config import to_yaml
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.ledger import CURRICULUM, METRICS, TIMING, Checkpoint, Ledger, RunWriter, Status, find_ledgers
 from space_dist.report import (
     Estimate,
     Interval,
+    Report,
     build_report,
     confidence_interval,
     draw_comparison,
@@ -527,3 +531,17 @@ def test_generated_contexts_have_no_map(tmp_path: Path) -> None:
     with pytest.raises(LedgerError, match="not trained on generated contexts in every iteration"):
         draw_curriculum(run)  # its ledger does not say which
     assert build_report([ledger], tmp_path / "out").table[0]["set size at the end"] == "—"
+
+
+def test_configurations_never_look_alike_on_a_narrow_terminal(tmp_path: Path) -> None:
+    rows = [{"configuration": f"pointmass_small_space_kappa_{kappa}", "test return": "[1, 2]"} for kappa in range(40)]
+    told = []
+    for count, width in ((40, 80), (2, 80), (2, 200)):
+        to = Console(file=io.StringIO(), width=width)
+        print_report(Report(rows[:count], [], [], "", tmp_path / "report.png"), to)
+        told.append(to.file.getvalue())  # type: ignore[attr-defined]
+        assert all(row["configuration"] in told[-1] for row in rows[:count])
+        assert told[-1].count("[1, 2]") == count
+    assert "│" not in told[0]
+    assert "│" in told[1]
+    assert "│" in told[2]

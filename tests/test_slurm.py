@@ -264,6 +264,31 @@ def test_a_templates_fault_is_a_sentence(content: str, said: str, manifest: Mani
         render(Export(manifest, profile(), "array"), tmp_path)
 
 
+def test_a_file_that_replaces_no_template_is_refused(manifest: Manifest, tmp_path: Path) -> None:
+    made = Export(manifest, profile(), "array")
+    with pytest.raises(ConfigError, match=r"holds no file\. Ours, which may be replaced: README\.md\.j2, advance\."):
+        render(made, tmp_path)
+    (tmp_path := tmp_path / "mine").mkdir()
+    (tmp_path / ".hidden").touch()
+    (tmp_path / "finish.sh.j2").write_text('{% include "mine.txt" %}\n')
+    (tmp_path / "mine.txt").write_text("exit 0\n")
+    assert render(made, tmp_path)[TRAIN].endswith("exit 0\n")
+    (tmp_path / "sumbit.sh").touch()
+    said = r"sumbit\.sh replaces none of ours, .*; did you mean 'submit\.sh\.j2'\? Allowed: README\.md\.j2, .*cluster"
+    with pytest.raises(ConfigError, match=said):
+        render(made, tmp_path)
+
+
+def test_the_page_names_every_template_and_default() -> None:
+    page = (ROOT / "docs/slurm.md").read_text()
+    templates = [file.name for file in (ROOT / "space_dist/slurm/templates").iterdir()]
+    bare = Profile()
+    signal = f"`signal` is\n{bare.signal.name}, {bare.signal.lead_seconds} s before"
+    defaults = [f"`nodes` is {bare.nodes} in", f"`output` is `{bare.output}`", signal]
+    assert [word for word in (*(f"`{name}`" for name in templates), *defaults) if word not in page] == []
+    assert f"# nodes: 2 # cluster mode only; default: {bare.nodes}\n" in SITE.read_text()
+
+
 def test_a_template_that_is_no_text_is_a_sentence(manifest: Manifest, tmp_path: Path) -> None:
     (tmp_path / "finish.sh.j2").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match=r"finish\.sh\.j2 cannot be read"):
@@ -359,6 +384,13 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
     assert "SLURM jobs: train 103; aggregate 104; none in the queue now" in said
     assert f"what the jobs said is in {out / 'logs'}" in " ".join(said.split())
     assert run("slurm", "submit", tmp_path)[0] == 2
+    code, said = run("slurm", "submit", GRID)
+    assert (code, f"{GRID} is a file: name the folder DIR of" in " ".join(said.split())) == (2, True)
+    code, said = run("slurm", "export", GRID, "--out", GRID)
+    assert (code, f"--out {GRID} is a file; a folder" in " ".join(said.split())) == (2, True)
+    for option, value, key in (("--throttle", -1, "throttle"), ("--cells-per-task", 0, "cells_per_task")):
+        code, said = run("slurm", "export", GRID, "--out", tmp_path / "none", option, value)
+        assert (code, f"space-dist: {option} {value}: {key}: {value}: Input" in said) == (2, True)
     assert run("slurm", "export", out, "--out", tmp_path / "copy")[0] == 0
     code, said = run("slurm", "export", out, "--out", tmp_path / "copy", "--mode", "arry")
     assert (code, "did you mean 'array'?" in said) == (2, True)

@@ -166,11 +166,15 @@ def _schemas() -> dict[str, list[SchemaRow]]:
 
 def _about(asked: str, of: str, schemas: Mapping[str, list[SchemaRow]]) -> list[SchemaRow]:
     """Rows of a schema: of keys with these letters, and of sections of this kind. Raises ConfigError for none."""
+    from space_dist.config import what_sb3_calls
+
     if found := _rows_about(asked, schemas[of]):
         return found
     if others := [other for other, rows in schemas.items() if other != of and _rows_about(asked, rows)]:
         ways = " or ".join(f"--of {other}" for other in others)
         raise ConfigError(f"config schema: no key of a {of} has {asked!r} in it; {ways} shows one that has")
+    if (meant := what_sb3_calls(asked)) is not None:
+        raise ConfigError(f"config schema: no key has {asked!r} in it. {meant}")
     keys = {row[0].rpartition(".")[2] for row in schemas[of]}
     raise ConfigError(f"config schema: no key has {asked!r} in it{nearest(asked, keys)}")
 
@@ -199,7 +203,7 @@ def config_check(
     from space_dist import config as configs
     from space_dist.run.building import Blueprint
 
-    run = configs.load(config, list(overrides or []))
+    run = configs.load(config, list(overrides or []), to_check=True)
     with about(str(config)):
         blueprint = Blueprint.of(run)
         blueprint.setup(*blueprint.instances())

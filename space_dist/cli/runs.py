@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -46,13 +46,13 @@ def train(
     """Train one policy under one curriculum."""
     STOP.install()
     from space_dist import config as configs
+    from space_dist.config.reading import from_option
     from space_dist.run.launch import launch
     from space_dist.system.workplace import default_folder, lasting
 
-    settings = list(overrides or [])
-    if workers is not None:
-        settings.append(f"resources.workers={workers}")
-    run = configs.load(config, settings, seed=seed)
+    options = [("--workers", "resources.workers", workers), ("--seed", "seed", seed)]
+    settings = [from_option(*option) for option in options if option[-1] is not None]
+    run = configs.load(config, [*(overrides or ()), *settings])
     folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
     with about(str(config)), _display(run.name, run.seed) as (observe, waiting):
         outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe, waiting=waiting)
@@ -232,23 +232,34 @@ def _grid(path: Path, root: Path | None, scale: float, changes: Sequence[str]) -
 
 def print_report(result: Report, to: Console) -> None:
     """Show a report's table, its caveats, and where the files are."""
-    # One block per configuration where the terminal is too narrow for a row of so many columns.
     # Rich takes brackets for markup: those of names and intervals are to be seen.
-    wide = to.width >= _REPORT_WIDTH
-    if wide:
+    if to.width >= _REPORT_WIDTH:
         table = Table()
         for column in result.table[0]:
             table.add_column(column)
         for row in result.table:
             table.add_row(*(text.replace("[", r"\[") for text in row.values()))
+        to.print(table)
     else:
         table = Table("", *(row["configuration"].replace("[", r"\[") for row in result.table))
         for column in list(result.table[0])[1:]:
             table.add_row(column, *(row[column].replace("[", r"\[") for row in result.table))
-    to.print(table)
+        if to.measure(table, options=to.options.update(max_width=_REPORT_WIDTH)).maximum <= to.width:
+            to.print(table)
+        else:  # cut off, two configurations may look alike
+            _print_blocks(result.table, to)
     for remark in result.remarks:
         to.print(remark, highlight=False, markup=False)
     to.print(f"Figure and tables: {result.figure.parent}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _print_blocks(rows: Sequence[Mapping[str, str]], to: Console) -> None:
+    """A block of lines for each row, under its first text."""
+    for row in rows:
+        name, *others = row.items()
+        to.print(f"\n{name[1]}", style="bold", highlight=False, markup=False)
+        for column, text in others:
+            to.print(f"  {column}: {text}", highlight=False, markup=False)
 
 
 def print_grid_report(result: GridReport, to: Console) -> None:
@@ -261,12 +272,8 @@ def print_grid_report(result: GridReport, to: Console) -> None:
         for row in rows:
             table.add_row(*map(escape, row.values()))
         to.print(table)
-    else:  # a block for each cell
-        for row in rows:
-            name, *others = row.items()
-            to.print(f"\n{name[1]}", style="bold", highlight=False, markup=False)
-            for column, text in others:
-                to.print(f"  {column}: {text}", highlight=False, markup=False)
+    else:
+        _print_blocks(rows, to)
     if len(result.table) > len(rows):
         to.print(f"... and {len(result.table) - len(rows):,} more cells, all in cells.csv.", highlight=False)
     for remark in result.remarks:
@@ -297,7 +304,10 @@ def sync(
     from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs
+    from space_dist.tracking.store import usable_uri
 
+    place = "the tracking.uri of each" if uri is None else f"MLflow at {usable_uri(uri)}"
+    say(f"mirroring {', '.join(map(str, runs))} to {place}")
     named = [located(path) for path in runs]
     paths = [
         find_grid(path, root).folder
@@ -309,7 +319,7 @@ def sync(
     if follow:
         result = follow_runs(paths, uri, experiment)
     else:
-        result = sync_runs(found.ledgers, uri, experiment, grids=found.grids)
+        result = sync_runs(found.ledgers, uri, experiment, grids=found.grids, tell=say)
     console.print(
         f"{result.runs} runs are up to date in MLflow ({result.created} new, {result.rows} rows pushed"
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),

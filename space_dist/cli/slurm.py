@@ -88,15 +88,17 @@ def slurm_export(
 
     Those of a search train generation after generation, and submit the next ones themselves.
     """
+    from space_dist.config.reading import from_option
     from space_dist.slurm import Export, export, load_profile
 
     chosen = cast("Mode", one_of(_MODES, mode, "--mode"))
     if templates is not None and not templates.is_dir():
         raise ConfigError(f"--templates {templates} is no folder")
-    settings = list(overrides or [])
-    settings += [] if throttle is None else [f"throttle={throttle}"]
-    settings += [] if cells_per_task is None else [f"cells_per_task={cells_per_task}"]
-    site = load_profile(profile, settings)
+    if out.is_file():
+        raise ConfigError(f"--out {out} is a file; a folder for the scripts is wanted")
+    options = [("--throttle", "throttle", throttle), ("--cells-per-task", "cells_per_task", cells_per_task)]
+    settings = [from_option(*option) for option in options if option[-1] is not None]
+    site = load_profile(profile, [*(overrides or ()), *settings])
     manifest, instances = _frozen(grid, out)
     made = Export(manifest, site, chosen, None if root is None else root.absolute())
     for path in export(made, instances, out, templates):
@@ -116,6 +118,8 @@ def slurm_submit(folder: Annotated[Path, typer.Argument(metavar="DIR", help="An 
     from space_dist.slurm.export import SUBMIT
 
     script = folder / SUBMIT
+    if folder.is_file():
+        raise ConfigError(f"{folder} is a file: name the folder DIR of `space-dist slurm export {folder} --out DIR`")
     if not script.is_file():
         raise ConfigError(f"{folder} holds no {SUBMIT}: `space-dist slurm export GRID --out {folder}` writes one")
     raise typer.Exit(subprocess.run([_bash(), str(script.absolute())], check=False).returncode)

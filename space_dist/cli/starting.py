@@ -59,7 +59,9 @@ def init(
 ) -> None:
     """Write a project that runs as it is: environment, instances, config, grid, SLURM profile."""
     try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and not folder.is_dir():
+            raise ConfigError(f"{folder} is a file; a project is written into a folder of its own")
+        if folder.exists() and any(folder.iterdir()):
             raise ConfigError(f"{folder} is not empty; a project is written into a folder of its own")
         for source in sorted(path for path in _PROJECT.rglob("*") if path.is_file()):
             target = folder / str(source.relative_to(_PROJECT)).removesuffix(_DISGUISE)

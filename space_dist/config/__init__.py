@@ -31,7 +31,7 @@ from space_dist.config.drawing import (
     UniformConfig,
     ValueDisagreementConfig,
 )
-from space_dist.config.explaining import schema
+from space_dist.config.explaining import schema, what_sb3_calls
 from space_dist.config.growing import (
     ContextSpaceConfig,
     FixedConfig,
@@ -156,5 +156,6 @@ __all__ = [
     "shipped_files",
     "to_yaml",
     "told",
+    "what_sb3_calls",
     "with_what_it_names",
 ]

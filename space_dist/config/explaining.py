@@ -101,8 +101,8 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     context = fault.get("ctx", {})
     if kind == "extra_forbidden":
         allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
-        if root is RunConfig and (meant := _SB3_NAMES.get(path[-1])) is not None:
-            return f"{where}: {key}: unknown key. What Stable-Baselines3 calls {path[-1]} is {meant} here"
+        if root is RunConfig and (meant := what_sb3_calls(path[-1])) is not None:
+            return f"{where}: {key}: unknown key. {meant}"
         if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
             return f"{where}: {key}: unknown key; keys stand in sections: {' or '.join(f'{s}.{key}' for s in sections)}"
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
@@ -127,6 +127,11 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if kind == "tuple_type":
         return f"{where}: {key}: {short(given)}: Input should be a list"
     return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
+
+
+def what_sb3_calls(name: str) -> str | None:
+    """A sentence that says what a word of Stable-Baselines3's is in a run's config; None for any other."""
+    return f"What Stable-Baselines3 calls {name} is {_SB3_NAMES[name]} here" if name in _SB3_NAMES else None
 
 
 def _sections_with(key: str) -> list[str]:

@@ -20,15 +20,22 @@ from space_dist.errors import ConfigError
 _M = TypeVar("_M", bound=BaseModel)
 _CREDENTIALS = re.compile(r"//[^/\s]*@")
 _SEED = re.compile(r"^seed: 0$", re.MULTILINE)  # a run's own: those of sections do not begin a line
+# What `slurm.profile` reads and a run does not: it is above this package, which may not import it.
+_OF_PROFILES = frozenset((
+    "account", "aggregate", "apptainer", "apptainer_options", "cells_per_task", "command", "comment", "conda",
+    "constraint", "cpus_per_task", "dependency", "error", "exclude", "exclusive", "extra", "gpus", "gres", "interface",
+    "job_name", "mail_type", "mail_user", "max_array_size", "max_requeues", "mem", "mem_per_cpu", "modules", "nodelist",
+    "nodes", "output", "partition", "prologue", "qos", "reservation", "signal", "temp", "throttle", "time", "venv",
+))  # fmt: skip
 
 
-def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunConfig:
+def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None, to_check: bool = False) -> RunConfig:
     """Read a config file, apply `a.b=c` overrides and the seed, and check everything.
 
     Relative instance paths become absolute, from the config's folder (from the current one in an override).
-    Raises ConfigError with the file and key of every fault.
+    Raises ConfigError with the file and key of every fault. to_check: see `read`.
     """
-    data = read(path)
+    data = read(path, to_check=to_check)
     for override in overrides:
         apply_override(data, override)
     if seed is not None:
@@ -37,14 +44,20 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None) 
     return parse(data, str(path), origins)
 
 
-def read(path: Path) -> dict[str, Any]:
-    """A run's config as plain data, not checked yet; relative paths in it become absolute, from its folder."""
+def read(path: Path, *, to_check: bool = False) -> dict[str, Any]:
+    """A run's config as plain data, not checked yet; relative paths in it become absolute, from its folder.
+
+    Raises ConfigError for a file of another kind, with the command that takes it. to_check: whoever asks runs nothing.
+    """
     place = located(path)
     data = read_yaml(place)
+    command = "plan" if to_check else "run"
     if "arms" in data and "env" not in data:
-        raise ConfigError(f"{path} is a search, of many runs: space-dist tune run {path}")
+        raise ConfigError(f"{path} is a search, of many runs: space-dist tune {command} {path}")
     if "extends" in data and "env" not in data:
-        raise ConfigError(f"{path} is a grid, of many runs: space-dist grid run {path}")
+        raise ConfigError(f"{path} is a grid, of many runs: space-dist grid {command} {path}")
+    if not data.keys().isdisjoint(_OF_PROFILES) and data.keys().isdisjoint(RunConfig.model_fields.keys() - {"env"}):
+        raise ConfigError(f"{path} is a SLURM profile: space-dist slurm export GRID --out DIR --profile {path}")
     from_its_folder(data, place.absolute().parent)
     return data
 
@@ -120,6 +133,20 @@ def apply_override(data: dict[str, Any], override: str) -> None:
     put(data, name, from_folder(name, value, Path.cwd()), told(override))
 
 
+class _Typed(str):
+    """An override that was typed as an option of its own: `resources.workers=4`, from `--workers 4`."""
+
+    __slots__ = ("typed",)
+    typed: str
+
+
+def from_option(option: str, key: str, value: object) -> str:
+    """The override `key=value` that an option stands for; sentences about it name the option."""
+    override = _Typed(f"{key}={value}")
+    override.typed = f"{option} {value}"
+    return override
+
+
 def told(override: str) -> str:
     """An override as sentences name it: without the credentials of a URI."""
-    return f"--set {_CREDENTIALS.sub('//...@', override)}"
+    return override.typed if isinstance(override, _Typed) else f"--set {_CREDENTIALS.sub('//...@', override)}"

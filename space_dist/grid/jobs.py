@@ -12,9 +12,11 @@ import hashlib
 import logging
 import math
 import os
+import re
 import shlex
 import shutil
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -419,4 +421,6 @@ def _client(address: str) -> JobSubmissionClient:
 
 
 def _first(error: BaseException) -> str:
-    return str(error).splitlines()[0][:300] if str(error) else type(error).__name__
+    """An error's first sentence, or what fits of it in whole words."""
+    sentence = re.split(r"\.+(?:\s|$)", str(error).strip(), maxsplit=1)[0].partition("\n")[0]
+    return textwrap.shorten(sentence, 300, placeholder=" ...") or type(error).__name__

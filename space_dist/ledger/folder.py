@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
-from space_dist.errors import LedgerError
+from space_dist.errors import LedgerError, nearest
 from space_dist.ledger.checkpoint import FORMAT, READABLE, Checkpoint, decode_checkpoint
 from space_dist.ledger.lock import owner_alive
 from space_dist.ledger.rows import METRICS, ROW_FILES, Row, decode_row
@@ -97,6 +97,9 @@ class Ledger:
         try:
             content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
+            if not self.folder.exists():
+                beside = nearest(self.folder.name, (other.name for other in self.folder.parent.glob("*/")))
+                raise LedgerError(f"{self.folder} does not exist{beside.removesuffix('.')}") from None
             below = next((file.parent for file in sorted(self.folder.glob("*/status.json"))), None)
             hint = f"; {below} does" if below else ""
             raise LedgerError(f"{self.folder} holds no run: it has no status.json{hint}") from None

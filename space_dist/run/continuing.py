@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 from space_dist.config import DQNConfig, RunConfig
 from space_dist.errors import ConfigError
 from space_dist.ledger import Checkpoint, Status
 
+_GROWS: Final = "the budget of a run that is there may only grow: use --out DIR for a new run"
+
 
 def is_longer(before: RunConfig, now: RunConfig) -> bool:
-    """Whether `now` is `before` with a larger budget, in steps or episodes, and no smaller one.
+    """Whether `now`, which is `before` with another budget, has a larger one, in steps or episodes.
 
-    Raises ConfigError if it is, and what was done until now would have come out otherwise under that budget.
+    Raises ConfigError if it has a smaller one, and if what was done until now would have come out otherwise under the
+    larger.
     """
     old, new = before.budget, now.budget
-    if old == new or new.steps < old.steps:
+    if old == new:
         return False
+    if new.steps < old.steps:
+        raise ConfigError(f"budget.steps: {old.steps} -> {new.steps}: {_GROWS}")
     if new.episodes is not None and (old.episodes is None or new.episodes < old.episodes):
-        return False
+        raise ConfigError(f"budget.episodes: {old.episodes or 'no limit'} -> {new.episodes}: {_GROWS}")
     # Rows and checkpoints that are there must be those that the larger budget would have given.
     reason = _goes_by_budget(before)
     if reason is not None:

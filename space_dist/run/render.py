@@ -236,8 +236,9 @@ def draw_run(ledger: Ledger, folder: Path, ids: Sequence[int] | None = None) -> 
     """Write a GIF for each instance (without `ids`: three of the test set) and what trajectories there are.
 
     Returns (file, what happened in it). Raises ConfigError for unknown ids or an environment that cannot be drawn,
-    LedgerError if there is no policy or a file cannot be written.
+    LedgerError if there is no run, no policy, or a file cannot be written.
     """
+    ledger.status()
     with contextlib.closing(Gallery(ledger)) as gallery:
         chosen = gallery.some() if ids is None else gallery.find(ids)
         written = []

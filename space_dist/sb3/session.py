@@ -177,6 +177,7 @@ class Session:
             raise ConfigError(
                 f"CurriculumCallback: {settings.kind}, as it is set, plays rounds that are not learned from, and "
                 "model.learn learns from every one: train with space-dist"
+                + (", or set robust: false" if "robust" in type(settings).model_fields else "")
             )
         if self._wants.probes:
             self._refuse_probes()

@@ -6,6 +6,7 @@ a number or was made safe before, so that no template can forget it: in the READ
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 import shlex
@@ -16,10 +17,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import jinja2
+import jinja2.meta
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from space_dist.config import clean
-from space_dist.errors import ConfigError, LedgerError
+from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.slurm.arrays import Array, arrays_of
 from space_dist.slurm.profile import Profile, variables_in
@@ -278,6 +280,8 @@ def render(grid: Export, templates: Path | None = None) -> dict[str, str]:
         except Exception as error:  # a template may compute anything
             what = error.message if isinstance(error, jinja2.TemplateError) else f"{type(error).__name__}: {error}"
             raise ConfigError(f"template {_location(template, error)}: {what}") from None
+    if templates is not None:  # last: faults of theirs may hide what they include
+        _refuse_unused(templates, shell)
     return texts
 
 
@@ -296,6 +300,24 @@ def _refuse_variables(profile: Profile, templates: Path | None) -> None:
             raise ConfigError(f"template {file} cannot be read: {error}") from None
         if taken:
             raise ConfigError(f"env: {min(taken)} is a variable of the template {file}")
+
+
+def _refuse_unused(templates: Path, shell: jinja2.Environment) -> None:
+    """Raise ConfigError for a file that replaces none of our templates and is included by no other, or for no file."""
+    ours = jinja2.PackageLoader("space_dist.slurm").list_templates()
+    files = sorted(file for file in templates.iterdir() if file.is_file() and not file.name.startswith("."))
+    if not files:
+        raise ConfigError(f"--templates {templates} holds no file. Ours, which may be replaced: {', '.join(ours)}")
+    included: set[str | None] = set()
+    for file in files:
+        with contextlib.suppress(jinja2.TemplateError, OSError, ValueError):  # of one that these scripts do not need
+            included.update(jinja2.meta.find_referenced_templates(shell.parse(file.read_text())))
+    for file in files:
+        if file.name not in ours and not included & {file.name, None}:  # None: a name that is computed
+            raise ConfigError(
+                f"template {file} replaces none of ours, and none here includes it{nearest(file.name, ours)} "
+                f"Allowed: {', '.join(ours)}"
+            )
 
 
 @functools.lru_cache(maxsize=4)

@@ -1,4 +1,4 @@
-"""What a site and its user want from SLURM: one small YAML file. Only what is set is written into scripts."""
+"""What a site and its user want from SLURM: one small YAML file. Scripts hold what is set or has a default."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Aggregation(Section):
 
 
 class Profile(Section):
-    """A site's profile. Every field is optional; each is written only if it is set."""
+    """A site's profile. Every field is optional; one without a default is written only if it is set."""
 
     job_name: str | None = Field(default=None, pattern=NAME)
     """Name of the jobs; null: the grid's."""

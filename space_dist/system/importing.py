@@ -13,12 +13,13 @@ import importlib
 import importlib.machinery
 import importlib.metadata
 import importlib.util
+import os
 import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, nearest
 
 PYTHON = (sys.executable, "-P")
 """How a Python of ours is started: -P keeps what happens to lie in the current folder from being imported first."""
@@ -66,9 +67,14 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
     try:
         found = getattr(importlib.import_module(module), name, None)
     except (Exception, SystemExit) as error:  # somebody else's module may raise anything
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        # `pkg.py:Name` may be a module of that name, which lacks another.
+        if module.endswith(".py") and (module.startswith(".") or f"{module}.".startswith(f"{missing}.")):
+            raise ConfigError(f"{where}: leave out `.py`: {_as_import_path(module, name)}") from None
         what = f"{type(error).__name__}: {str(error)[:200]}"
-        if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
-            what += f". It was looked for where Python looks (PYTHONPATH), and last in {Path.cwd()}"
+        if missing == module.partition(".")[0]:
+            hint = nearest(missing, _modules_here())
+            what += f"{hint} It was looked for where Python looks (PYTHONPATH), and last in {Path.cwd()}"
         raise ConfigError(f"{where}: cannot import {module!r}: {what}") from error
     if of_library is not None and isinstance(found, type) and issubclass(found, of_library):
         return found
@@ -80,6 +86,20 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
             "made yourself: define a function that calls it"
         )
     return found
+
+
+def _as_import_path(file: str, name: str) -> str:
+    """What names a file's module, and where to start if it lies in no folder below the current one."""
+    path = Path(os.path.relpath(file)).with_suffix("")
+    if ".." in path.parts:
+        return f"{path.name}:{name}, and start in {Path(file).parent}"
+    return f"{'.'.join(path.parts)}:{name}"
+
+
+def _modules_here() -> list[str]:
+    """The modules and packages of the current folder."""
+    here = Path.cwd()
+    return [*(file.stem for file in here.glob("*.py")), *(file.parent.name for file in here.glob("*/__init__.py"))]
 
 
 def why_refused(import_path: str) -> str | None:

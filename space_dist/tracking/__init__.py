@@ -122,16 +122,17 @@ def _grid_around(path: Path) -> Path | None:
 
 
 def sync(
-    ledgers: Sequence[Ledger], uri: str | None = None, experiment: str | None = None, *, grids: Sequence[Grid] = ()
-) -> SyncResult:
+    ledgers: Sequence[Ledger], uri: str | None = None, experiment: str | None = None, *, grids: Sequence[Grid] = (),
+    tell: Callable[[str], None] = lambda what: None,
+) -> SyncResult:  # fmt: skip
     """Bring MLflow up to date with the committed rows of the runs and grids. Doing it again changes nothing.
 
     `uri` and `experiment` default to each run's own (`tracking.uri`, `tracking.experiment` of its config), or to its
-    grid's. A run that was deleted in MLflow is replayed afresh.
+    grid's. A run that was deleted in MLflow is replayed afresh. `tell` hears of each run and grid that is begun with.
 
     Raises ConfigError for a URI or experiment that cannot be used, TrackingError if a store cannot be reached.
     """
-    return _Mirror(uri, experiment).push(Found(tuple(ledgers), tuple(grids)))
+    return _Mirror(uri, experiment, tell).push(Found(tuple(ledgers), tuple(grids)))
 
 
 def follow(
@@ -207,9 +208,11 @@ class _Mirror:
     saw_life: whether a run was alive when last looked at. looking_seconds: what that took for the grids.
     """
 
-    def __init__(self, uri: str | None, experiment: str | None) -> None:
+    def __init__(
+        self, uri: str | None, experiment: str | None, tell: Callable[[str], None] = lambda what: None
+    ) -> None:  # fmt: skip
         self._uri = None if uri is None else usable_uri(uri)
-        self._experiment = experiment
+        self._experiment, self._tell = experiment, tell
         self._stores: dict[str, Store] = {}
         self._open_sinks: dict[str, Sink] = {}
         self._settled: dict[Path, tuple[Status, bool]] = {}
@@ -253,6 +256,7 @@ class _Mirror:
             sink.push(snapshot)
         result = SyncResult(1)
         if target is not None:
+            self._tell(f"{ledger.folder}: to MLflow at {target[0]}")
             store, experiment = self._store(target[0]), target[1]
             # One writer at a time: SQLite gives up on a second one after its busy timeout.
             with store.exclusively():
@@ -277,11 +281,13 @@ class _Mirror:
         if uri is None:
             n_mirrored = mirror.begun - len(mirror.failed)
             return SyncResult(n_mirrored, failed=mirror.failed) if sinks else SyncResult(skipped=mirror.begun)
+        if mirror.changed:
+            self._tell(f"{grid.folder}: to MLflow at {usable_uri(uri)}")
         store, experiment = self._store(usable_uri(uri)), self._experiment or manifest.experiment
         created = rows = 0
         if mirror.changed:
             try:
-                created, rows = mirror.push(manifest, store, experiment)
+                created, rows = mirror.push(manifest, store, experiment, self._tell)
             except RefusedError as error:
                 return SyncResult(failed={grid.folder: str(error)})
         pages = (store.page(experiment),)

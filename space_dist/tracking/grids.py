@@ -133,14 +133,18 @@ class GridMirror:
             except OSError as error:
                 self.failed[self.grid.folder / cell.id] = str(error)
 
-    def push(self, manifest: Manifest, store: Store, experiment: str) -> tuple[int, int]:
+    def push(
+        self, manifest: Manifest, store: Store, experiment: str, tell: Callable[[str], None] = lambda what: None
+    ) -> tuple[int, int]:  # fmt: skip
         """(runs of the grid that are new there, rows of theirs pushed) to bring the store up to the last look.
+
+        `tell` hears of each run before it is pushed.
 
         Raises TrackingError if it cannot be reached, RefusedError if it does not take the grid itself.
         """
         try:
             with store.exclusively(self.grid.tracking_lock):
-                return self._push(manifest, store, experiment)
+                return self._push(manifest, store, experiment, tell)
         except TrackingError:
             self._take_nothing_for_granted()  # who knows what was lost
             raise
@@ -150,7 +154,9 @@ class GridMirror:
         self._pending = {run.key: run for run, *_ in self._runs if self._looks[run.key].begun}
         self._pending_cells = {run.cell.id: run.cell for run in self._pending.values()}
 
-    def _push(self, manifest: Manifest, store: Store, experiment: str) -> tuple[int, int]:
+    def _push(
+        self, manifest: Manifest, store: Store, experiment: str, tell: Callable[[str], None]
+    ) -> tuple[int, int]:  # fmt: skip
         created = rows = 0
         parent = self._parent(manifest)
         parent_id = store.find_parent(parent, experiment)
@@ -171,6 +177,7 @@ class GridMirror:
             owner = parent_id if above is None else above.run_id
             # The stamp is the last thing that a push writes: who has it has everything, and MLflow is asked nothing.
             if child is None or (child.stamp, child.ending, child.parent) != (part.stamp, part.ending, owner):
+                tell(f"{manifest.name}: {run.title}")
                 try:
                     run_id, new, pushed = store.push(
                         self._snapshot(run, part), experiment, child.run_id if child else None,

@@ -52,7 +52,8 @@ class Pusher:
         with contextlib.suppress(OSError), self._log_file.open("rb") as log:
             log.seek(self._said_before)
             lines = log.read(_MOST_SAID).decode(errors="replace").splitlines()
-            return [line.removeprefix(LOOK_AT) for line in lines if line.startswith(LOOK_AT)]
+            # Each once: the pusher of a conductor that was killed writes its own into the same file.
+            return list(dict.fromkeys(line.removeprefix(LOOK_AT) for line in lines if line.startswith(LOOK_AT)))
         return []
 
 
