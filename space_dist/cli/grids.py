@@ -100,7 +100,7 @@ def grid_plan(
     print_cells(manifest, found)
     say(
         f"{_of(len(manifest.cells), 'cell')} x {_of(len(manifest.seeds), 'seed')} = {_of(len(found), 'run')}, "
-        f"{made.steps:,} environment steps; {manifest.cpus_per_run} CPU{'s' if manifest.cpus_per_run > 1 else ''} a run"
+        f"{made.steps:,} environment steps in whole updates; {_of(manifest.cpus_per_run, 'CPU')} a run"
         + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )
     other = sum(run_status.other_code for run_status in done)
