@@ -20,6 +20,7 @@ from ruamel.yaml import YAML
 from space_dist import config as configs
 from space_dist.config import RunConfig, dump, identity, load, schema
 from space_dist.config.plain_yaml import to_yaml
+from space_dist.config.reading import from_option
 from space_dist.errors import ConfigError
 from tests.config_texts import Raw, leaves, replaced
 
@@ -113,7 +114,7 @@ def kinds(section: str) -> list[str]:
 def test_what_is_written_of_a_config_is_all_of_it_whatever_was_written_before() -> None:
     for overrides in ([], ["fork={seed: 0, steps: 5}"], ["budget.steps=30000"]):
         for seed in (3, 0, 41):
-            config = load(SPACE, overrides, seed=seed)
+            config = load(SPACE, [*overrides, f"seed={seed}"])
             assert dump(config) == to_yaml(config.model_dump(mode="json"))
 
 
@@ -189,8 +190,9 @@ def test_overrides(override: str, key: str, expected: Any) -> None:
     assert type(value) is type(expected)
 
 
-def test_overrides_are_applied_in_order_and_the_seed_last() -> None:
-    config = load(SPACE, ["seed=1", "curriculum={kind: round_robin}", "rollout.slots=8", "rollout.slots=2"], seed=9)
+def test_overrides_are_applied_in_order_and_what_options_say_last() -> None:
+    overrides = ["seed=1", "curriculum={kind: round_robin}", "rollout.slots=8", "rollout.slots=2"]
+    config = load(SPACE, [*overrides, from_option("--seed", "seed", 9)])
     assert (config.seed, config.curriculum.kind, config.rollout.slots) == (9, "round_robin", 2)
 
 

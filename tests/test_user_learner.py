@@ -162,6 +162,10 @@ def test_a_run_that_failed_before_its_first_round_holds_nobody_up(example: Path)
     with pytest.raises(SpaceDistError, match="cannot be made of"):
         launch(chosen("learner.kwargs={targte: 3.0}"), run, resume=False, stop=StopRequests())
     assert Ledger(run).status().state == "failed"
+    (run / "metrics.jsonl").touch()  # as of one that failed later
+    with pytest.raises(SpaceDistError, match="already holds a run"):
+        launch(right, run, resume=False, stop=StopRequests())
+    (run / "metrics.jsonl").unlink()
     launch(right, run, resume=False, stop=StopRequests())
     assert results(run) == trained(example / "alone", "learner.kwargs={target: 3.0}")
     with pytest.raises(SpaceDistError, match="already holds a run"):

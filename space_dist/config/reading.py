@@ -29,8 +29,8 @@ _OF_PROFILES = frozenset((
 ))  # fmt: skip
 
 
-def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None, to_check: bool = False) -> RunConfig:
-    """Read a config file, apply `a.b=c` overrides and the seed, and check everything.
+def load(path: Path, overrides: Sequence[str] = (), *, to_check: bool = False) -> RunConfig:
+    """Read a config file, apply `a.b=c` overrides in their order, and check everything.
 
     Relative instance paths become absolute, from the config's folder (from the current one in an override).
     Raises ConfigError with the file and key of every fault. to_check: see `read`.
@@ -38,8 +38,6 @@ def load(path: Path, overrides: Sequence[str] = (), *, seed: int | None = None, 
     data = read(path, to_check=to_check)
     for override in overrides:
         apply_override(data, override)
-    if seed is not None:
-        data["seed"] = seed
     origins = {override.partition("=")[0].strip(): told(override) for override in overrides}
     return parse(data, str(path), origins)
 

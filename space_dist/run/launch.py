@@ -36,7 +36,7 @@ from space_dist.errors import (
     exits_refused,
 )
 from space_dist.learner import torch_checks
-from space_dist.ledger import FORMAT, GIVEN, Ledger, RunWriter, State, Status, decode_checkpoint
+from space_dist.ledger import FORMAT, GIVEN, METRICS, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
@@ -305,13 +305,14 @@ def arithmetic_digest() -> str:
 
 
 def _is_stillborn(ledger: Ledger) -> bool:
-    """Whether a run failed there before it had committed anything, as by a wrong argument of its learner.
+    """Whether a run failed there before its first row, as by a wrong argument of its learner.
 
     Nothing is lost if one of another config takes its place.
     """
     with contextlib.suppress(LedgerError):
         status = ledger.status()
-        return status.state == "failed" and status.checkpoint is None and not ledger.checkpoint_files()
+        began = status.checkpoint is not None or ledger.checkpoint_files() or (ledger.folder / METRICS).exists()
+        return status.state == "failed" and not began
     return False
 
 

@@ -281,11 +281,10 @@ class _Mirror:
         if uri is None:
             n_mirrored = mirror.begun - len(mirror.failed)
             return SyncResult(n_mirrored, failed=mirror.failed) if sinks else SyncResult(skipped=mirror.begun)
-        if mirror.changed:
-            self._tell(f"{grid.folder}: to MLflow at {usable_uri(uri)}")
         store, experiment = self._store(usable_uri(uri)), self._experiment or manifest.experiment
         created = rows = 0
         if mirror.changed:
+            self._tell(f"{grid.folder}: to MLflow at {usable_uri(uri)}")
             try:
                 created, rows = mirror.push(manifest, store, experiment, self._tell)
             except RefusedError as error:
