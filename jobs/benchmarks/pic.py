@@ -146,8 +146,7 @@ def _run(rank: str, seed: int, steps: int) -> dict[str, float]:
         ROOT / "configs/pointmass_space.yaml",
         [f"curriculum={{kind: space, pic: {rank}, eta: 1.0e+9, kappa: 2}}", "learner.update=lean",
          f"budget.steps={steps}", "evaluation.every_steps=100000000", "tracking.uri=null",
-         "checkpoint.every_rounds=100000", "checkpoint.every_seconds=100000"],
-        seed=seed,
+         "checkpoint.every_rounds=100000", "checkpoint.every_seconds=100000", f"seed={seed}"],
     )  # fmt: skip
     blueprint = Blueprint.of(config)
     cluster = _Watched(config, blueprint.setup(*blueprint.instances()))
