@@ -20,7 +20,7 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.learner import OnPolicyLearner, Update
 from space_dist.learner.population import PopulationLearner, learn_together, refuse, stack_key
 from space_dist.learner.stack import Adam, Stack
-from space_dist.learner.stacked import PPO
+from space_dist.learner.stacked import PPO, Minibatches
 from space_dist.learner.trust_region import TRPO
 from space_dist.ledger import Checkpoint, decode_checkpoint, encode_checkpoint
 from space_dist.rollout import Shard
@@ -76,6 +76,14 @@ def doubled(learner: OnPolicyLearner, env_id: str) -> OnPolicyLearner:
     policy = learner.model.policy.double()
     extractor = Doubled(make_batched(env_id, 1, context_visible=True).observation_space)
     policy.features_extractor = policy.pi_features_extractor = policy.vf_features_extractor = extractor
+    buffer: Any = learner.model.rollout_buffer
+    drawn = buffer._get_samples
+
+    def samples(*given: Any) -> Any:  # torch's mse_loss took two types only later than 2.11
+        found = drawn(*given)
+        return found._replace(returns=found.returns.double())
+
+    buffer._get_samples = samples
     return learner
 
 
@@ -148,7 +156,19 @@ def watch_population(members: int, patched: pytest.MonkeyPatch) -> list[Gradient
     return steps
 
 
-@pytest.mark.parametrize("device", ["cpu", CUDA])
+def round_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a population's advantages differ in float32's last digit, as where a GPU sums them in another order."""
+    draw, random = Minibatches.draw, torch.Generator().manual_seed(0)
+
+    def drawn(self: Minibatches, places: NDArray[np.int64]) -> None:
+        draw(self, places)
+        noise = 2.0 * torch.rand(self.pulls.shape, dtype=self.pulls.dtype, generator=random) - 1.0
+        self.pulls.mul_(1.0 + 2.0**-24 * noise)
+
+    monkeypatch.setattr(Minibatches, "draw", drawn)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cpu, rounding otherwise", CUDA])
 @pytest.mark.parametrize(
     ("kind", "env_id", "activation", "net_arch", "kernel"),
     [
@@ -162,8 +182,15 @@ def test_every_member_learns_what_stable_baselines3_does(
     kind: str, env_id: str, activation: str, net_arch: tuple[int, ...], kernel: str, device: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Twenty updates in float64, from the same rollouts. A batch size that leaves a smaller last minibatch."""
-    updates = 20
+    """Twenty updates in float64, from the same rollouts. A batch size that leaves a smaller last minibatch.
+
+    Advantages are float32, as SB3's. Where those round otherwise, members begin each update with SB3's weights: over
+    many updates TRPO's conjugate gradients would make much of that digit.
+    """
+    updates, exact = 20, device == "cpu"
+    if device == "cpu, rounding otherwise":
+        device = "cpu"
+        round_otherwise(monkeypatch)
     if kernel == "together":
         monkeypatch.setattr(Adam, "_row_by_row", Adam._together)  # what devices other than the CPU use
     passes = {"n_epochs": 2} if kind == "ppo" else {"n_critic_updates": 2}
@@ -200,6 +227,8 @@ def test_every_member_learns_what_stable_baselines3_does(
                     np.testing.assert_allclose(ours[name], array, rtol=1e-5, atol=1e-5, err_msg=f"{name}, {place}")
             least_steps.append(expected.gradient_steps)
             found.append(expected.metrics.get("is_line_search_success"))
+            if not exact:
+                mine.load(*reference.save())
     if kind == "ppo":
         assert min(least_steps) < 6 == max(least_steps)  # target_kl has stopped some, and left others alone
     else:

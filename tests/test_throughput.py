@@ -106,7 +106,7 @@ def test_what_cannot_be_kept_is_said_before_anything_is_measured(
     words: Sequence[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("benchmarks.throughput._missing", lambda: pytest.fail("it went on"))
+    monkeypatch.setattr("benchmarks.throughput.not_installed", lambda: pytest.fail("it went on"))
     monkeypatch.setattr("benchmarks.equivalence._Arms", lambda *_: pytest.fail("it went on"))
     (tmp_path / "damaged.json").write_text("{bad")
     (tmp_path / "list.json").write_text("[1, 2]")
@@ -223,7 +223,7 @@ def test_an_ended_benchmark_leaves_no_process_behind(number: signal.Signals, tmp
     code = (
         # A shell has what it starts in the background ignore SIGINT, and so what that starts.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        "import runpy, sys; import benchmarks.throughput as t; t._missing = lambda: ['rllib', 'jax', 'sbx'];"
+        "import runpy, sys; import benchmarks.throughput as t; t.not_installed = lambda: ['rllib', 'jax', 'sbx'];"
         "sys.argv = ['benchmark.py', 'throughput', '--only', 'pointmass', '--seconds', '600'];"
         f"runpy.run_path({str(ROOT / 'jobs/benchmark.py')!r}, run_name='__main__')"
     )

@@ -93,6 +93,7 @@ class Contender:
     overrides, checkout: of ours, more settings of the config, and another version.
     vec_env, n_envs: SB3's and SBX's dummy or subproc, or batched, ours in its interface.
     runners, n_envs: RLlib's processes and the environments of each.  flags: XLA's.
+    device: where ours and JAX's learn, and JAX's collects. `stacked` of ours is the update alone, of so many members.
     """
 
     kind: str
@@ -108,6 +109,7 @@ class Contender:
     slots: int = 0
     overrides: tuple[str, ...] = ()
     checkout: str = ""
+    device: str = "cpu"
 
     @property
     def title(self) -> str:
@@ -133,15 +135,16 @@ class Contender:
     @property
     def pinned(self) -> bool:
         """Whether a process of it keeps to one core."""
-        return self.kind == "jax" or self.update == "population"
+        return self.device == "cpu" and (self.kind == "jax" or self.update == "population")
 
     @property
     def setting(self) -> str:
         """What was chosen for it."""
         threads = f"{self.threads} torch thread{'s' if self.threads > 1 else ''}"
         slots = f", {self.slots} slots" if self.slots else ""
-        if self.kind == "jax" or self.update == "population":
-            members = f"{self.members} member{'s' if self.members > 1 else ''} on a core{slots}"
+        if self.kind == "jax" or self.update in ("population", "stacked"):
+            where = "on a core" if self.device == "cpu" else "on the GPU"
+            members = f"{self.members:,} member{'s' if self.members > 1 else ''} {where}{slots}"
             return f"{members}, XLA_FLAGS={self.flags!r}" if self.kind == "jax" else members
         if self.kind == "sbx":
             return f"XLA_FLAGS={self.flags!r}"
@@ -182,7 +185,7 @@ def measure(task: Task, contender: Contender, seconds: float, clock: Callable[[]
     if contender.kind == "rllib":
         _rllib(task, contender, watch)
     elif contender.kind == "ours":
-        (_population if contender.update == "population" else _ours)(task, contender, watch)
+        {"population": _population, "stacked": _stacked}.get(contender.update, _ours)(task, contender, watch)
     else:
         _sb3(task, contender, watch)
     return {"rate": watch.rate()}
@@ -247,13 +250,29 @@ def _population(task: Task, contender: Contender, watch: _Stopwatch) -> None:
         works = dict[Path, Any]()
         for seed in range(contender.members):
             path = Path(folder) / str(seed)
-            config = task.run_config("engine=population", f"seed={seed}", *contender.overrides)
+            device = [] if contender.device == "cpu" else [f"device={contender.device}"]
+            config = task.run_config("engine=population", f"seed={seed}", *device, *contender.overrides)
             works[path] = population.member(config, path, stop=stop)
         works[path] = watched(works[path])
         try:
             population.advance(works, ended)
         except _Measured:
             return
+
+
+def _stacked(task: Task, contender: Contender, watch: _Stopwatch) -> None:
+    """Whole updates of a stack of members, of samples that nobody has collected."""
+    from benchmarks import kernel
+
+    _, settings = _settings(task)
+    update = kernel.stacked_update(
+        _shape(task), task.batch_size, task.n_steps, settings.n_epochs, contender.members, contender.device
+    )
+    steps, enough = 0, watch.mark(0)
+    while not enough:
+        update()
+        steps += task.n_steps * contender.members
+        enough = watch.mark(steps)
 
 
 def _single(config: configs.RunConfig) -> Callable[[], gym.Env[Any, Any]]:
@@ -288,7 +307,7 @@ def _jax(task: Task, contender: Contender, mark: Callable[[int], bool]) -> float
 
 
 def _start_xla(contender: Contender) -> None:
-    os.environ |= {"XLA_FLAGS": contender.flags, "JAX_PLATFORMS": "cpu"}
+    os.environ |= {"XLA_FLAGS": contender.flags, "JAX_PLATFORMS": contender.device}
 
 
 def _sb3(task: Task, contender: Contender, watch: _Stopwatch) -> None:
@@ -339,6 +358,17 @@ def _settings(task: Task) -> tuple[configs.RunConfig, PPOConfig]:
     if not isinstance(config.learner, PPOConfig):
         raise TypeError(f"{task.config} trains no PPO")
     return config, config.learner
+
+
+def _shape(task: Task) -> Any:
+    """The actor's and the critic's, as `space_dist.kernels.Shape`."""
+    from space_dist.kernels import Shape
+
+    config, settings = _settings(task)
+    env = _batched(config, 1)
+    inputs, space = int(np.prod(env.observation_space.shape or ())), env.action_space
+    outputs = int(space.n) if isinstance(space, gym.spaces.Discrete) else int(np.prod(space.shape or ()))
+    return Shape(inputs, outputs, isinstance(space, gym.spaces.Discrete), settings.net_arch, settings.activation)
 
 
 def _batched(config: configs.RunConfig, n_slots: int) -> BatchedEnv:
@@ -402,17 +432,14 @@ def limits(task: Task) -> dict[str, float]:
     import torch
 
     from benchmarks import kernel
-    from space_dist.kernels import Shape
 
     torch.set_num_threads(1)
-    config, settings = _settings(task)
+    config, _ = _settings(task)
     one, many = _single(config)(), _batched(config, task.slots)
     found = {"single": _single_seconds(one), "batched": _batched_seconds(many, config)}
-    inputs = int(np.prod(many.observation_space.shape or ()))
-    space = many.action_space
-    outputs = int(space.n) if isinstance(space, gym.spaces.Discrete) else int(np.prod(space.shape or ()))
-    widths = [inputs, *settings.net_arch]
-    products = 2 * sum(a * b for a, b in itertools.pairwise(widths)) + widths[-1] * (outputs + 1)
+    shape = _shape(task)
+    widths = [shape.inputs, *shape.hidden]
+    products = 2 * sum(a * b for a, b in itertools.pairwise(widths)) + widths[-1] * (shape.outputs + 1)
     # Forward; backward, by weights and by inputs, of which the first layer needs none.
     learning = EPOCHS * (3 * products - 2 * widths[0] * widths[1])
     matrix = torch.ones(512, 512)
@@ -421,7 +448,6 @@ def limits(task: Task) -> dict[str, float]:
         matrix @ matrix
         count += 1
     per_product = (time.perf_counter() - start) / (count * 512**3)
-    shape = Shape(inputs, outputs, isinstance(space, gym.spaces.Discrete), settings.net_arch, settings.activation)
     update = EPOCHS / task.batch_size * kernel.seconds(shape, task.batch_size)
     return found | {"arithmetic": (products + learning) * per_product, "kernel": update}
 

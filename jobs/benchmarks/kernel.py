@@ -6,13 +6,14 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 import numba
 import numpy as np
 import torch
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 
 from space_dist.kernels import Layout, Settings, Shape, aligned, prepare
@@ -39,7 +40,7 @@ def kernel(
     console.print(f"this core: {limit / 1e9:.0f} GFLOP/s of products in its first cache")
     for hidden, size in SHAPES.items():
         shape = Shape(7, 2, False, hidden, "tanh")
-        works = [_compiled(shape, size), _stacked(shape, size)]
+        works = [_compiled(shape, size), stacked_update(shape, size, size * MINIBATCHES, 1, MEMBERS, "cpu")]
         times: list[list[float]] = [[], []]
         for _ in range(rounds):
             for taken, work in zip(times, works, strict=True):
@@ -102,18 +103,26 @@ def _compiled(shape: Shape, size: int) -> Callable[[], object]:
     return lambda: update(m, layout.plan, layout.layers, settings, flat, orders, size, told)
 
 
-def _stacked(shape: Shape, size: int) -> Callable[[], object]:
-    random, n = torch.Generator().manual_seed(0), size * MINIBATCHES
-    stack = Stack(shape, MEMBERS, device=torch.device("cpu"), dtype=torch.float32)
+def stacked_update(
+    shape: Shape, size: int, n_steps: int, epochs: int, members: int, device: str
+) -> Callable[[], object]:  # fmt: skip
+    """The stacked update of so many members, each of `n_steps` samples in minibatches of `size`; permutations too."""
+    random = torch.Generator().manual_seed(0)
+    stack = Stack(shape, members, device=torch.device(device), dtype=torch.float32)
     for name in stack.layout.names:
         parameter = stack.parameter(stack.weights, name)
         parameter.copy_(0.1 * torch.randn(parameter.shape, generator=random))
 
     def drawn(*more: int) -> torch.Tensor:
-        return torch.randn(MEMBERS, n, *more, generator=random)
+        return torch.randn(members, n_steps, *more, generator=random).to(stack.device)
 
     samples = Samples(drawn(shape.inputs), drawn(shape.outputs), drawn(), drawn(), drawn())
     own = PPOSettings(3e-4, 0.2, 0.0, 0.5, 0.5, math.inf, True)
-    orders = np.tile(np.random.default_rng(0).permutation(n), (MEMBERS, 1))
-    ppo = PPO(stack, samples, [own] * MEMBERS, size)
-    return lambda: ppo.run([orders])
+    numbers = [np.random.RandomState(member) for member in range(members)]
+
+    def orders() -> Iterator[NDArray[np.int64]]:
+        for _ in range(epochs):
+            yield np.stack([each.permutation(n_steps) for each in numbers])
+
+    ppo = PPO(stack, samples, [own] * members, size)
+    return lambda: ppo.run(orders())

@@ -139,7 +139,7 @@ def throughput(
     kept(settings)  # before anything is measured
     checkout = "" if before is None else str(before.resolve())
     parts = only or PARTS
-    missing = _missing()
+    missing = not_installed()
     table: dict[str, dict[str, Row]] = {}
     for name in [name for name in TASKS if name in parts]:
         found = _searched(name, settings, functools.partial(_search, name, seconds, missing))
@@ -258,7 +258,7 @@ def _rows(task: str, found: dict[str, Contender], seconds: float, checkout: str)
     return {
         name: Row(
             contender.title, contender.setting,
-            lambda contender=contender: _measured(task, contender, seconds),  # type: ignore[misc]
+            lambda contender=contender: measured(task, contender, seconds),  # type: ignore[misc]
             _waits(contender, costs), costs["kernel"],
         )
         for name, contender in found.items()
@@ -280,9 +280,7 @@ def _best_jax(task: str, seconds: float, *, members: int) -> Contender:
 
 def fastest(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
     """The fastest in one short measurement each; one that does not get it done in a minute is none."""
-    rates = {
-        contender: _measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders
-    }
+    rates = {contender: measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders}
     for contender, rate in rates.items():
         console.print(
             f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s",
@@ -335,7 +333,7 @@ def _population_rows(
         """By time of learning, in as many processes as there are cores."""
         rows[name] = Row(
             f"{contender.title}, {CORES} processes at a time", f"{learning}; {contender.setting}",
-            lambda: _measured("pointmass", contender, seconds, processes=CORES),
+            lambda: measured("pointmass", contender, seconds, processes=CORES),
             {cause: wait / CORES for cause, wait in _waits(contender, costs).items()}, kernel,
         )  # fmt: skip
 
@@ -362,7 +360,7 @@ def _population_rows(
 # ---- how it is measured ----
 
 
-def _measured(
+def measured(
     task: str, contender: Contender, seconds: float, *, processes: int = 1, patience: float | None = None
 ) -> dict[str, float]:
     """`rate`: steps per second of so many processes at once, together; 0 if they take longer than `patience` seconds.
@@ -429,7 +427,7 @@ def _finish(process: subprocess.Popen[str], wanted: str, patience: float | None 
     return found
 
 
-def _missing() -> list[str]:
+def not_installed() -> list[str]:
     """Who of the extra `bench` cannot be imported. Ray ships RLlib without what it needs."""
     tried = subprocess.run([sys.executable, "-c", "import ray.rllib.algorithms.ppo"], capture_output=True, check=False)
     found = {"rllib": tried.returncode == 0}
