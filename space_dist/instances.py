@@ -179,7 +179,9 @@ class InstanceSet:
         return InstanceSet(self.ids[chosen], self.contexts[chosen], self.names, columns)
 
 
-def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False) -> InstanceSet:
+def read_csv(
+    path: Path | str, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False
+) -> InstanceSet:
     r"""The instances of a CSV file, checked whole.
 
     The first line names `id`, the features of `bounds` and the further `columns`, in any order, and nothing else; each
@@ -192,7 +194,7 @@ def read_csv(path: Path, bounds: ContextBounds, columns: Sequence[str] = (), *, 
     feature is not a number within its bounds, a further column not a finite number, or if an id or a context occurs
     twice.
     """
-    columns = [name for name in columns if name not in bounds.names]
+    path, columns = Path(path), [name for name in columns if name not in bounds.names]
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:

@@ -63,7 +63,7 @@ class Example:
         monkeypatch.setattr(runs, "STOP", StopRequests())
         Path(f"{self.name}.py").write_text(code)
         self.config.write_text(config)
-        sample = self.blocks("bash")[0].splitlines()[0].split()[1:]
+        sample = self.blocks("bash")[0].splitlines()[0].partition("#")[0].split()[1:]
         assert command(monkeypatch, *sample, "--train", 12, "--test", 3) == 0
         yield
         for module in (self.name, "others"):

@@ -54,6 +54,8 @@ FAULTS = {
     "WantsInWords": "its `wants` must be a space_dist.curricula.Wants, not a tuple",
     "LogsNaN": "step() logs mean_return = nan, which is no number: log None where there is none",
     "LogsArrays": "step() logs scores = an array of dtype float64",
+    "ForgetsToAsk": "feedback.episodes is None, for the class does not say that it wants them: "
+    "wants = Wants(episodes=True)",
     "NeedsEpisodes": "step() where no episode ended fails: ValueError",
     "Unmakeable": "cannot be made: KeyError: 'no such setting'",
     "nothing": "made a str, which is no curriculum: derive its class from space_dist.curricula.Curriculum",
@@ -77,7 +79,9 @@ def test_without_fault(kind: str) -> None:
     findings = check(f"tests.faulty_curricula:{kind}", instances(), BOUNDS)
     assert findings.faults == []
     notes = {
-        "NeedsSuccess": ["(success is NaN), it fails: ValueError: did it succeed?"],
+        "NeedsSuccess": [
+            "ValueError: did it succeed?; if it has to know, say Wants(success=True), and other environments"
+        ],
         "NeverChanges": ["in 30 decisions it selected the same instances", "its order_version changes"],
     }.get(kind, [])
     assert len(findings.notes) == len(notes)

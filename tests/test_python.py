@@ -299,6 +299,9 @@ def test_a_policy_acts_as_the_run_does(tmp_path: Path) -> None:
     assert drawn.tolist() == run.policy(seed=3).predict(seen, deterministic=False)[0].tolist()
     with pytest.raises(ConfigError, match=r"has the shape \(2,\), or \(n, 2\), not \(3,\)"):
         policy.predict(np.zeros(3))
+    assert policy.values(seen).tolist() == pytest.approx([policy.values(each) for each in seen], abs=1e-6)
+    with pytest.raises(ConfigError, match="without its context has 1 numbers, not the shape \\(5, 2\\)"):
+        policy.with_context(seen, np.array([0.5]))
     with pytest.raises(ConfigError, match="contexts of shape"):
         policy.with_context(plain, np.zeros(4))
     with pytest.raises(ConfigError, match="it has no number 1"):

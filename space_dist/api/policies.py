@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 class ActingPolicy:
     """One policy of a run.
 
-    policy: its networks (`values` says what states are worth).  spec: of its environment: spaces, horizon, and the
-    bounds of contexts.
+    policy: its networks.  spec: of its environment: spaces, horizon, and the bounds of contexts.
     """
 
     def __init__(self, policy: Policy, spec: EnvironmentSpec, *, seed: int = 0) -> None:
@@ -61,6 +60,16 @@ class ActingPolicy:
         executed = head.executed(actions)
         return (executed[0] if single else executed), memory.values
 
+    def values(self, observation: Observations) -> NDArray[np.float64]:
+        """`(..., obs) -> (...)` what the states are worth, V(s), in unscaled reward units.
+
+        observation: as for `predict`. Of a recurrent policy: where an episode begins. Raises ConfigError for another
+        shape.
+        """
+        batch, single = self._batched(observation)
+        values = self.policy.values(batch)
+        return values[0] if single else values  # type: ignore[no-any-return]
+
     def _memory(self, count: int, state: NDArray[np.float32] | None, episode_start: ArrayLike | None) -> Memory:
         memory = Memory(self.policy, count)
         if memory.values is not None and state is not None:
@@ -79,7 +88,7 @@ class ActingPolicy:
 
         context: in environment units; it is scaled from its bounds to [-1, 1] (what lies beyond them: to the nearest of
         them), and put behind flat observations, or beside the parts of others. Raises ConfigError for a context of
-        another length.
+        another length, or flat observations of one.
         """
         if not self.spec.context_visible:
             return observation
@@ -89,6 +98,12 @@ class ActingPolicy:
             parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
             return {**parts, "context": scaled}
         plain = np.asarray(observation, dtype=np.float32)
+        own = int(np.prod(self.spec.observation_space.shape or ())) - scaled.shape[-1]
+        if plain.shape[-1:] != (own,):
+            raise ConfigError(
+                f"an observation without its context has {own} numbers, not the shape {plain.shape}; the context's "
+                f"{scaled.shape[-1]} are put behind them"
+            )
         return np.concatenate([plain, np.broadcast_to(scaled, (*plain.shape[:-1], scaled.shape[-1]))], axis=-1)
 
     def _batched(self, observation: Observations) -> tuple[Observations, bool]:

@@ -111,7 +111,9 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tags = [tag.strip("' ") for tag in str(context.get("expected_tags") or _tags(path[0])).split(",")]
         given_kind = given.get("kind") if isinstance(given, dict) else given
-        hint = nearest(str(given_kind), tags) if given_kind is not None else "."
+        if given_kind is None:
+            return f"{where}: {key}: this key is required. Allowed: {', '.join(tags)}"
+        hint = nearest(str(given_kind), tags)
         return f"{where}: {key}: {short(given_kind)} is not known{hint} Allowed: {', '.join(tags)}"
     if kind == "value_error":
         message = str(context.get("error", fault["msg"]))

@@ -115,12 +115,26 @@ class Custom(Curriculum):
 
     def step(self, state: Any, feedback: Feedback) -> tuple[State, Selection, Numbers]:
         """See `Curriculum`. The numbers hold at least `size`, how many instances are selected."""
-        answer: Any = self._own.step(state, feedback)
+        try:
+            answer: Any = self._own.step(state, feedback)
+        except (AttributeError, TypeError) as error:
+            if feedback.episodes is None and "NoneType" in str(error):
+                self._refuse(
+                    f"step() fails: {type(error).__name__}: {str(error)[:200]}. feedback.episodes is None, for the "
+                    "class does not say that it wants them: wants = Wants(episodes=True)"
+                )
+            raise
         if not isinstance(answer, tuple) or len(answer) != 3:
             self._refuse("step() must return (state, selection, numbers for the log)")
         new, selection, numbers = answer
         self._look_at_state(new, state.version + 1, "step()")
         self._look_at_selection(selection, new, "step()")
+        before = self._own.selection(state)
+        if selection.order_version == before.order_version and not np.array_equal(selection.ids, before.ids):
+            self._refuse(
+                "step() selects other instances under the same order_version, and the walk over the old ones would go "
+                "on; set order_version to the version at which ids last changed"
+            )
         return new, selection, self._plain(numbers, selection)
 
     def selection(self, state: Any) -> Selection:

@@ -29,15 +29,16 @@ from space_dist.seeding import Purpose, UInt64Array, instance_keys
 class Space(Curriculum):
     """The instances whose start value rose most, from a set that grows whenever values settle.
 
+    instances: the training instances, n of them.
     seed: decides the first instance and ties.
     first: (n,) scores of which the highest decides the first instance instead; None: the seed.
     eta: growth threshold: the relative change of the mean start value below which the set grows (paper: eta).
     kappa: how many instances a growth adds (paper: kappa).
     rank: what line 12 ranks by (paper: d_t(i)).
-    mean: which reading of lines 6-7 decides.
-    growth: `multiply` multiplies the size by kappa; `schedule` adds kappa without asking the values.
-    adaptive_eta, patience, epsilon: Theorem 2: behind `patience` tests in a row without growth, the next one is made
-        with an eta that lets the set grow; `persistent` never lowers it again.
+    mean: which reading of lines 6-7 decides: `same_set`, `as_printed` or `mean_abs_change` (docs/curricula.md).
+    growth: `add`; `multiply` multiplies the size by kappa; `schedule` adds kappa without asking the values.
+    adaptive_eta, patience, epsilon: Theorem 2 (`off`, `once`, `persistent`): behind `patience` tests in a row without
+        growth, the next one is made with an eta that lets the set grow; `persistent` never lowers it again.
     """
 
     state_type = SetState

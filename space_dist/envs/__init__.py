@@ -55,7 +55,9 @@ BULLET_IDS = frozenset({"space_dist/AntGoal-v0", "space_dist/BallCatching-v0"})
 
 
 def make_single(env_id: str, **kwargs: Any) -> SingleEnv:
-    """The Gymnasium environment behind a registered id."""
+    """The Gymnasium environment behind a registered id of ours. Raises ConfigError for another."""
+    if env_id not in BATCHED:
+        raise ConfigError(f"env.id {env_id!r} is none of ours{nearest(env_id, BATCHED)} Allowed: {', '.join(BATCHED)}")
     return SingleEnv(lambda n_slots: BATCHED[env_id](n_slots, **kwargs))
 
 

@@ -52,7 +52,7 @@ def _goes_by_budget(config: RunConfig) -> str | None:
     if learner.import_path is not None:
         return f"learner.import: {learner.import_path} may go by how much of the budget is left"
     if config.curriculum.may_probe:
-        return f"curriculum.kind: {config.curriculum.kind} probes as long as the budget has room for it"
+        return f"curriculum.kind: {config.curriculum.kind} may probe as long as the budget has room for it"
     return None
 
 

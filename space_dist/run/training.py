@@ -67,7 +67,11 @@ SCALES_ROUND = (1 << 32) - 1  # the round in which first scales are measured
 
 @dataclass
 class Progress:
-    """What a display shows."""
+    """What a display shows, and a function that is given as `progress` is called with.
+
+    steps, budget_steps: environment steps.  set_size: how many of `n_instances` are selected.  train_return,
+    test_return: means of the last evaluation; None before the first.
+    """
 
     steps: int
     budget_steps: int
