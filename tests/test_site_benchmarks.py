@@ -14,15 +14,18 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import typer
 
 from space_dist.arithmetic import SETTINGS
+from space_dist.errors import SpaceDistError
 from tests.commanding import command
 from tests.grids import ROOT
 from tests.shell import Shell, executes, one_server
@@ -30,7 +33,7 @@ from tests.shell import Shell, executes, one_server
 sys.path.append(str(ROOT / "jobs"))
 
 import benchmark
-from benchmarks import chaos, contenders, equivalence, kernel, off_policy, optuna_study, throughput, tune
+from benchmarks import chaos, contenders, equivalence, gpu, kernel, off_policy, optuna_study, throughput, tune
 from benchmarks.faults import KINDS, Fault, Hit, Result
 
 
@@ -108,6 +111,44 @@ def test_equivalence(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pyte
 
 
 @executes(("performance.md", 4))
+def test_gpu(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Asked of processes of `contenders` as on a GPU; JAX's are as fast as they have environments."""
+    monkeypatch.setattr(gpu, "_gpu", lambda: "GPU of a test")
+    monkeypatch.setattr(gpu, "not_installed", list)
+    asked: list[contenders.Contender] = []
+
+    def found(wanted: list[tuple[str, contenders.Contender]], patience: float | None = None) -> list[dict[str, float]]:
+        assert patience is None or patience > 0
+        ((specification, contender),) = wanted
+        given = json.loads(specification)
+        assert given["core"] == (0 if contender.device == "cpu" else None)
+        assert contenders.Contender(**given["contender"] | {"overrides": ()}) == contender
+        asked.append(contender)
+        return [{"rate": 1e6 + contender.slots} | ({"compile": 2.0} if contender.kind == "jax" else {})]
+
+    monkeypatch.setattr(throughput, "_together", found)
+    bench.block("performance.md", 4)
+    told = capsys.readouterr().out
+    assert "| JAX, everything jitted | 1,024 members on the GPU, 256 slots, XLA_FLAGS=''; 2.0 s to compile" in told
+    assert "| 1,000,256 (1,000,256-1,000,256) |" in told
+    measured = asked[2 * len(gpu.SLOTS) :]
+    assert [(one.update, one.members, one.device) for one in measured[: len(measured) // 2]] == [
+        ("population", 256, "cuda"), ("stacked", 256, "cuda"), ("stock", 256, "cuda"),
+        ("population", 1024, "cuda"), ("stacked", 1024, "cuda"), ("stock", 1024, "cuda"), ("population", 32, "cpu"),
+    ]  # fmt: skip
+    # A process of `contenders` that is asked for the update alone.
+    alone = contenders.Contender("ours", update="stacked", members=2)
+    assert contenders.measure(contenders.TASKS["pointmass"], alone, 0.01, time.perf_counter)["rate"] > 0.0
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_there_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu, "measured", lambda *_: pytest.fail("it went on"))
+    with pytest.raises(SpaceDistError, match="torch finds no GPU on this machine"):
+        gpu.gpu()
+
+
+@executes(("performance.md", 5))
 def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Two trials of two seeds and an update each; Optuna's study with all seeds in processes of its own."""
     ran, studies = tune.completed, []
@@ -133,7 +174,7 @@ def test_tune(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     sizes = {"trials": 2, "seeds": 2, "generation": 1, "steps": 2048, "rounds": 1, "n-envs": 64}
     bench.more = tuple(word for name, size in sizes.items() for word in (f"--{name}", str(size)))
     with one_server():
-        bench.block("performance.md", 4)
+        bench.block("performance.md", 5)
     assert [(one["seeds"], one["evaluations"], one["processes"]) for one in studies] == [(2, [0, 2048], 1),
                                                                                          (1, [0, 2048], 1)]  # fmt: skip
     taken = {name: rounds for name, (*rounds,) in json.loads((bench.folder / "tune.json").read_text()).items()}
@@ -170,7 +211,7 @@ def test_throughput(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
         throughput, "process", lambda *_: dict.fromkeys(("kernel", "batched", "single", "arithmetic"), 1e-5)
     )
     monkeypatch.setattr(throughput, "_grid_seconds", lambda *_: 1.0)
-    monkeypatch.setattr(throughput, "_missing", lambda: [*throughput.EXTRA])
+    monkeypatch.setattr(throughput, "not_installed", lambda: [*throughput.EXTRA])
     codes: list[int] = []
 
     def answer(words: list[str]) -> int:
