@@ -46,7 +46,10 @@ class ContextBounds:
         _check_names(self.names)
         low, high = (np.array(side, dtype=np.float64) + 0.0 for side in (self.low, self.high))
         if low.shape != (len(self.names),) or high.shape != low.shape:
-            raise ConfigError(f"bounds of shapes {low.shape} and {high.shape} for {len(self.names)} features")
+            raise ConfigError(
+                f"bounds of shapes {low.shape} and {high.shape} for {len(self.names)} names of features: "
+                f"{', '.join(self.names)}"
+            )
         with np.errstate(over="ignore", invalid="ignore"):
             usable = np.isfinite(high - low) & (low < high)
         if not usable.all():
@@ -216,7 +219,7 @@ def read_features(path: Path, columns: Sequence[str] = ()) -> tuple[InstanceSet,
 
     All columns but `id` and `columns` are features. Raises ConfigError as `read_csv` does.
     """
-    names = tuple(name for name in _named_columns(path) if name not in ("id", *columns))
+    names = tuple(name for name in named_columns(path) if name not in ("id", *columns))
     if not names:
         raise ConfigError(f"{_shown_path(path)}: row 1 names no feature")
     wide = np.full(len(names), _WIDE)
@@ -226,7 +229,8 @@ def read_features(path: Path, columns: Sequence[str] = ()) -> tuple[InstanceSet,
     return instances, ContextBounds(names, low, np.where(high > low, high, low + np.maximum(1.0, np.abs(low))))
 
 
-def _named_columns(path: Path) -> list[str]:
+def named_columns(path: Path) -> list[str]:
+    """The columns that a CSV file's first line names. Raises ConfigError if it cannot be read."""
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:
@@ -292,7 +296,8 @@ def _check_kind_and_size(path: Path) -> None:
     try:
         status = path.stat()
     except FileNotFoundError:
-        raise ConfigError("there is no such file") from None
+        beside = nearest(path.name, (file.name for file in path.parent.glob("*.csv")))
+        raise ConfigError(f"there is no such file{beside.removesuffix('.')}") from None
     except ValueError:  # Python's answer to a NUL in the name
         raise ConfigError("this cannot be the name of a file") from None
     if stat.S_ISDIR(status.st_mode):

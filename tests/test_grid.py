@@ -407,7 +407,9 @@ def test_a_stopped_run_lacks_no_explanation(
         print_failures(run_statuses(grid, manifest, CODE), by_cause=False)
         said[cause] = capsys.readouterr().out
     assert said[Cause.STOPPED].rstrip().endswith("waiting: stopped")
-    assert said[Cause.KILLED].rstrip().endswith("failed: killed by an unknown hand; no more is known")
+    what, way = said[Cause.KILLED].splitlines()
+    assert what.endswith("failed: killed by an unknown hand; no more is known")
+    assert way == f"`space-dist grid retry {grid.folder} --cause killed` lets it be tried again"
 
 
 def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:

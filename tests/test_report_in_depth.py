@@ -161,6 +161,18 @@ def test_an_instance_that_falls_is_forgotten(tmp_path: Path) -> None:
     assert [text for name, text in row.items() if name.startswith("fall by")] == ["1.0 [—] of 4 (1/1)"] * 3
 
 
+def test_where_nothing_is_learned_nothing_is_forgotten(tmp_path: Path) -> None:
+    """Every return is 0, as on a sparse world at first; a NaN on another task is nobody's business."""
+    points = [{"env.id": "space_dist/PointMass-v0"}, {"env.id": "space_dist/Maze-v0"}]
+    made = make_grid(tmp_path / "grid", points, n_seeds=2, kind="space")
+    for seed in range(2):
+        finish(made, 0, seed, [EARLY[3]] * 6, [[0.0] * 4] * 7)
+        finish(made, 1, seed, [EARLY[3]] * 6, [[0.0, 1.0, 2.0, number] for number in range(7)])
+    report = build_grid_report(made)
+    assert [row["cell"] for row in tables(report.markdown)["Forgetting"]] == ["env.id=space_dist/Maze-v0"]
+    assert [float(row["test_return_iqm"]) for row in rows(report.folder / "cells.csv")] == [0.0, 2.25]
+
+
 def test_each_task_has_figures_of_its_own(tmp_path: Path) -> None:
     """Returns of two environments have no common scale."""
     points = [{"env.id": "space_dist/PointMass-v0"}, {"env.id": "space_dist/Maze-v0"}]

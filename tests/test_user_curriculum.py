@@ -41,7 +41,7 @@ def test_the_example_in_the_documentation_is_short_and_works(
     assert len({tuple(one) for one in played}) > 1
     assert rows[0]["curriculum"]["never_played"] > 0
     assert command(monkeypatch, "explain", "run", "--iteration", "1") == 2
-    assert "custom chooses by rules of its own, so it has no lines 6 to 12" in capsys.readouterr().err
+    assert "custom chooses by rules of its own, so it has no lines 6 to 13" in capsys.readouterr().err
 
 
 @pytest.mark.ray

@@ -68,7 +68,7 @@ class ActingPolicy:
         """
         batch, single = self._batched(observation)
         values = self.policy.values(batch)
-        return values[0] if single else values  # type: ignore[no-any-return]
+        return values[0] if single else values
 
     def _memory(self, count: int, state: NDArray[np.float32] | None, episode_start: ArrayLike | None) -> Memory:
         memory = Memory(self.policy, count)

@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 
 import typer
 
-from space_dist.cli.overview import display, print_cells, print_failures, status_json, summary, tell, workers_in_words
+from space_dist.cli.overview import (
+    Watching,
+    display,
+    print_cells,
+    print_failures,
+    status_json,
+    summary,
+    tell,
+    workers_in_words,
+)
 from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.system.extras import needed_from
@@ -235,7 +244,7 @@ def grid_status(
     place, manifest = _found(grid, root, scale, changes or ())
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
-    watched = WatchedQueue(place.folder)
+    watched, watching = WatchedQueue(place.folder), Watching()
     while True:
         queue = watched.now()
         found = run_statuses_of(place, manifest)
@@ -247,7 +256,8 @@ def grid_status(
             print_cells(manifest, found)
             print_failures(found, by_cause)
             say(summary(manifest, found) + workers_in_words(place, queue))
-        if not watch or output_left() or all(run_status.condition in ("done", "failed") for run_status in found):
+        settled = all(run_status.condition in ("done", "failed") for run_status in found)
+        if not watch or output_left() or settled or watching.is_over(place, queue, found):
             raise typer.Exit(exit_code(found))
         time.sleep(_WATCH_SECONDS)
 

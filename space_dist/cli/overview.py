@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LOG_SECONDS = 30.0
 _SHOWN_RUNS = 12
+_IDLE_LOOKS = 2  # of --watch
 _ANY_WIDTH = 10_000  # characters
 _COUNT_SECONDS = 5.0  # between two looks at how far all running runs are
 
@@ -175,6 +176,8 @@ def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
         say(f"{run_status.run.title}: {run_status.in_words}{_why(run_status)}")
     if len(unwell) > _SHOWN_RUNS:
         say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
+    for way in dict.fromkeys(one.way_out for one in unwell if one.condition == "failed"):
+        say(way)
 
 
 def _why(run_status: RunStatus) -> str:
@@ -201,6 +204,19 @@ def workers_in_words(place: Grid, queue: Queue | None) -> str:
         over = queue.answered and not queue.live and logs.is_dir()
         return f"\n{queue.in_words()}" + (f"; what the jobs said is in {logs}" if over else "")
     return "" if place.owner_alive() else "; nobody is working on it now"
+
+
+class Watching:
+    """When `--watch` is over: when nothing is left to do, or nobody works any more on what somebody has worked on."""
+
+    def __init__(self) -> None:
+        self._begun, self._idle = False, 0
+
+    def is_over(self, place: Grid, queue: Queue | None, found: Sequence[RunStatus]) -> bool:
+        """Told at each look. What Slurm says may be late, and was idle twice before it is believed."""
+        working = place.owner_alive() or bool(queue and queue.live) or any(one.condition == "running" for one in found)
+        self._begun, self._idle = self._begun or working, 0 if working else self._idle + 1
+        return self._begun and self._idle >= _IDLE_LOOKS
 
 
 def tell(manifest: Manifest, place: Grid, found: Sequence[RunStatus]) -> int:

@@ -138,7 +138,7 @@ def explain(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
     iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
 ) -> None:
-    """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 12)."""
+    """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 13)."""
     from space_dist.instances import read_csv
     from space_dist.ledger import Ledger
     from space_dist.report.decisions import explain as explain_decision
@@ -205,10 +205,14 @@ def report(
     """Compare runs, or the cells of a grid: figures and tables with 95 % intervals over seeds."""
     from space_dist.api.reports import is_grid
     from space_dist.config import located
+    from space_dist.experiment.manifest import in_root
     from space_dist.ledger import find_ledgers
     from space_dist.report import build_grid_report, build_report
+    from space_dist.system.workplace import workplace
 
     paths = [located(path) for path in paths]
+    if len(paths) == 1:
+        paths = [in_root(paths[0], workplace() / "runs" if root is None else root)]
     if len(paths) == 1 and is_grid(paths[0]):
         grid = _grid(paths[0], root, scale, changes or ())
         print_grid_report(build_grid_report(grid, out, baseline=baseline, threshold=threshold), console)
@@ -300,20 +304,17 @@ def sync(
 ) -> None:
     """Replay runs and grids into MLflow. Doing it twice changes nothing."""
     from space_dist.config import located
-    from space_dist.experiment.manifest import MANIFEST, find_grid
+    from space_dist.experiment.manifest import find_grid, in_root
     from space_dist.tracking import find
     from space_dist.tracking import follow as follow_runs
     from space_dist.tracking import sync as sync_runs
     from space_dist.tracking.store import usable_uri
 
-    place = "the tracking.uri of each" if uri is None else f"MLflow at {usable_uri(uri)}"
+    place = "the tracking.uri of each of them" if uri is None else f"MLflow at {usable_uri(uri)}"
     say(f"mirroring {', '.join(map(str, runs))} to {place}")
     named = [located(path) for path in runs]
     paths = [
-        find_grid(path, root).folder
-        if path.is_file() or (not path.exists() and (root / path / MANIFEST).is_file())
-        else path
-        for path in named
+        find_grid(path, root).folder if path.is_file() else path for path in (in_root(path, root) for path in named)
     ]
     found = find(paths)
     if follow:

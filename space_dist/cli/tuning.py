@@ -27,7 +27,7 @@ from space_dist.cli.grids import (
     run_statuses_of,
     started_ahead,
 )
-from space_dist.cli.overview import display, print_failures, summary, workers_in_words
+from space_dist.cli.overview import Watching, display, print_failures, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
 from space_dist.errors import ConfigError
 from space_dist.system.extras import needed_from
@@ -127,7 +127,7 @@ def tune_status(
     from space_dist.slurm.queue import WatchedQueue
 
     place = find_tune(tune, root_of(root))
-    watched = WatchedQueue(place.folder)
+    watched, watching = WatchedQueue(place.folder), Watching()
     while True:
         queue = watched.now()
         manifest = place.manifest()
@@ -148,7 +148,7 @@ def tune_status(
                 say(f"now: {summary(manifest, found)}{workers_in_words(place, queue)}")
         idle = not place.owner_alive() and not (queue and queue.live)
         held_up = settled and any(one.condition == "failed" for one in found) and idle
-        if not watch or output_left() or search.over or held_up:
+        if not watch or output_left() or search.over or held_up or watching.is_over(place, queue, found):
             raise typer.Exit(0 if search.over else _FAILED if held_up else _UNFINISHED)
         time.sleep(_WATCH_SECONDS)
 

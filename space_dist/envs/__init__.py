@@ -8,6 +8,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -209,6 +210,11 @@ def _alike(module: str, name: str) -> str:
     return nearest(name, found).removesuffix(".")
 
 
+def _example(env_id: str) -> str:
+    """An import path: of a module here that was named alone, or of nobody's."""
+    return f"{env_id}:MyEnv" if Path(f"{env_id.replace('.', '/')}.py").is_file() else "my_package.my_module:make"
+
+
 def _find(env_id: str) -> Callable[..., Any]:
     if env_id in BATCHED:
         return BATCHED[env_id]
@@ -218,7 +224,7 @@ def _find(env_id: str) -> Callable[..., Any]:
     if not colon:
         raise ConfigError(
             f"env.id {env_id!r} is not known{nearest(env_id, BATCHED)} Known: {', '.join(BATCHED)}, "
-            "an id registered with Gymnasium, or an import path like my_package.my_module:make"
+            f"an id registered with Gymnasium, or an import path: MODULE:NAME, like {_example(env_id)}"
         )
     carl = module.partition(".")[0] == "carl"
     # Only where needed: leaving `catch_warnings` has Python forget what it has warned of already.

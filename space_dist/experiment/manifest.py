@@ -605,6 +605,19 @@ class Grid:
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")
 
 
+def in_root(path: Path, root: Path) -> Path:
+    """The folder of the grid that is called so below `root`; of anything else that a user may name, the path itself.
+
+    Raises ConfigError, with the nearest name, for a name that neither a file or folder here nor a grid there has.
+    """
+    if path.exists() or len(path.parts) != 1 or path.suffix or ":" in path.name:
+        return path
+    if not Grid(root / path).manifest_file.exists():
+        known = [file.parent.name for file in sorted(root.glob(f"*/{MANIFEST}"))]
+        raise ConfigError(f"{path} is neither here nor a grid in {root}{nearest(path.name, known)}".removesuffix("."))
+    return root / path
+
+
 def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()) -> Grid:
     """The grid that a user names: its folder, its manifest.json, its name below `root`, or its YAML file (frozen below
     `root`, at a scale and with changes).
@@ -612,8 +625,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
     Raises ConfigError if there is nothing of the kind, and for a scale or changes of what is frozen already;
     NotPlannedError if a YAML file's grid was never frozen.
     """
-    if not path.exists() and len(path.parts) == 1 and Grid(root / path).manifest_file.exists():
-        path = root / path
+    path = in_root(path, root)
     if scale != scaling.WHOLE and (path.is_dir() or path.name == MANIFEST):
         raise ConfigError(f"{path} is frozen already, with its seeds and steps; --scale is for a grid's YAML file")
     if changes and (path.is_dir() or path.name == MANIFEST):

@@ -18,7 +18,17 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, Section
 from space_dist.errors import ConfigError, NotPlannedError, nearest
-from space_dist.experiment.manifest import MANIFEST, MAX_RUNS, Grid, GridTracking, Retry, RunResources, SeedRange, Seeds
+from space_dist.experiment.manifest import (
+    MANIFEST,
+    MAX_RUNS,
+    Grid,
+    GridTracking,
+    Retry,
+    RunResources,
+    SeedRange,
+    Seeds,
+    in_root,
+)
 
 MAX_TRIALS = 10_000  # of an arm
 _MAX_CHOICES = 1000
@@ -470,10 +480,11 @@ def put(data: dict[str, Any], key: str, value: Any, folder: Path) -> None:
 
 
 def find_tune(path: Path, root: Path) -> Grid:
-    """The search that a user names: its folder, or its YAML file (planned below `root`).
+    """The search that a user names: its folder, its name below `root`, or its YAML file (planned below `root`).
 
     Raises ConfigError if the path names no search, NotPlannedError if a YAML file's search was never planned.
     """
+    path = in_root(path, root)
     grid = Grid(path) if path.is_dir() else Grid(root / load_tune(path).name)
     if not grid.manifest_file.exists():
         raise NotPlannedError(

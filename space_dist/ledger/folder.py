@@ -98,8 +98,7 @@ class Ledger:
             content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
             if not self.folder.exists():
-                beside = nearest(self.folder.name, (other.name for other in self.folder.parent.glob("*/")))
-                raise LedgerError(f"{self.folder} does not exist{beside.removesuffix('.')}") from None
+                raise absent(self.folder) from None
             below = next((file.parent for file in sorted(self.folder.glob("*/status.json"))), None)
             hint = f"; {below} does" if below else ""
             raise LedgerError(f"{self.folder} holds no run: it has no status.json{hint}") from None
@@ -172,7 +171,10 @@ class Ledger:
         checks: list[Callable[[], object]] = [
             functools.partial(self.read, self.folder / name) for name in self.status().files
         ]
-        checks += [functools.partial(self.rows, name, committed_only=True) for name in ROW_FILES]
+        done = self.status().state == "done"  # of whose rows a checkpoint covers all
+        checks += [functools.partial(self.rows, name, committed_only=not done) for name in ROW_FILES]
+        if self.checkpoint_files():  # who removed them all, of a run that is done, wanted the room
+            checks.append(self.last_checkpoint)
         found = []
         for check in checks:
             try:
@@ -194,10 +196,10 @@ class Ledger:
             with contextlib.suppress(LedgerError, ValueError):
                 return decode_checkpoint(read_whole(self.checkpoints / name))
             name = self.status().checkpoint
-        raise LedgerError(
-            f"the last checkpoint in {self.checkpoints}, {name}, is damaged or missing; --resume goes on from the one "
-            "before it"
-        )
+        there = [file.name for file in self.checkpoint_files()]
+        what = "damaged" if name in there else "missing"
+        way_out = "`train --resume` goes back to the one before it" if {*there} - {name} else "there is no other"
+        raise LedgerError(f"the last checkpoint in {self.checkpoints}, {name}, is {what}; {way_out}")
 
     def abandoned(self, status: Status) -> bool:
         """Whether the run was left behind by a process that is gone, and could not say why."""
@@ -208,12 +210,18 @@ class Ledger:
         return owner_alive(self.lock_file)
 
 
+def absent(folder: Path) -> LedgerError:
+    """What to say of a folder that is not there, with the nearest name beside it."""
+    hint = nearest(folder.name, (other.name for other in folder.parent.glob("*/")))
+    return LedgerError(f"{folder} does not exist{hint.removesuffix('.')}")
+
+
 def find_ledgers(paths: list[Path]) -> list[Ledger]:
     """Every run in or below `paths`, sorted by path, each once. Raises LedgerError where there is none."""
     found: dict[Path, Ledger] = {}
     for path in paths:
         if not path.exists():
-            raise LedgerError(f"{path} does not exist")
+            raise absent(path)
         below = [Ledger(path)] if (path / "status.json").exists() else []
         below += [Ledger(file.parent) for file in path.rglob("status.json") if path.is_dir()]
         if not below:

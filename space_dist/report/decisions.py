@@ -23,7 +23,7 @@ _SHOWN = 12  # instances of a list or a table; the rest are counted
 def explain(
     ledger: Ledger, config: RunConfig, bounds: ContextBounds, train: InstanceSet, iteration: int
 ) -> list[str]:  # fmt: skip
-    """Lines 6 to 12 behind an iteration, counted from 1.
+    """Lines 6 to 13 behind an iteration, counted from 1.
 
     config, train: the run's; bounds: of its contexts. Raises ConfigError where nothing is decided about sets, or there
     is no such iteration; LedgerError where the values of a decision are not there, or lead to another set than the run
@@ -33,7 +33,7 @@ def explain(
     if not isinstance(settings, GrowingConfig | RoundRobinConfig | FixedConfig):
         what = "chooses by rules of its own" if isinstance(settings, CustomConfig) else "draws its instances"
         raise ConfigError(
-            f"{ledger.folder}: curriculum.kind: {settings.kind} {what}, so it has no lines 6 to 12; "
+            f"{ledger.folder}: curriculum.kind: {settings.kind} {what}, so it has no lines 6 to 13; "
             "explained are space, random_growth, cspace, manual, round_robin and fixed"
         )
     if len(config.curricula) > 1 or config.fork is not None:

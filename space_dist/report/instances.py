@@ -94,7 +94,8 @@ def _mean_curve(curves: Sequence[tuple[IntArray, FloatArray]]) -> tuple[IntArray
 def forgetting(cells: Sequence[CellRuns], curves: Curves) -> dict[str, dict[float, Interval]]:
     """By cell and share of the range of all returns of the task: how many instances fall again by that, mean over runs.
 
-    Without cells whose runs have too few evaluations, or a return that is no number.
+    Without cells whose runs have too few evaluations, or a return that is no number, and without tasks in which every
+    return is the same.
     """
     found = {}
     for cell in cells:
@@ -102,6 +103,8 @@ def forgetting(cells: Sequence[CellRuns], curves: Curves) -> dict[str, dict[floa
         if min(len(returns) for returns in own) < FEWEST or any(np.isnan(returns).any() for returns in own):
             continue
         whole = span([returns for other in cells if other.task == cell.task for _, returns in curves[other.cell.id]])
+        if not whole:
+            continue
         counts = {share: [float(forgotten(returns, share * whole).sum()) for returns in own] for share in SHARES}
         most = float(own[0].shape[1])
         found[cell.cell.id] = {share: estimate(np.array(each)).mean.within(0.0, most) for share, each in counts.items()}

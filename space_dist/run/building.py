@@ -18,7 +18,7 @@ from space_dist.curricula.making import make_curriculum
 from space_dist.curricula.replay import Replay
 from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError, about, nearest
-from space_dist.instances import InstanceSet, read_csv, refuse_overlap, refuse_padding
+from space_dist.instances import InstanceSet, named_columns, read_csv, refuse_overlap, refuse_padding
 from space_dist.learner import (
     CoupledLearner,
     Ensemble,
@@ -96,6 +96,11 @@ class Blueprint:
         """
         files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.columns_read
         with about("instances.train"):
+            if wanted := [name for name in columns if name not in (there := named_columns(files.train))]:
+                raise ConfigError(
+                    f"{files.train} has no column {wanted[0]!r}, which the curriculum reads"
+                    f"{nearest(wanted[0], (name for name in there if name not in ('id', *bounds.names)))}"
+                )
             train = read_csv(files.train, bounds, columns)
         with about("instances.test"):
             test = read_csv(files.test, bounds, columns, if_there=True)
@@ -259,9 +264,14 @@ class Blueprint:
             )
         asks_success = curriculum.wants.probes or curriculum.wants.success
         if asks_success and not self.spec.knows_success(curriculum.start()[1].contexts[:1]):
+            others = (
+                ". curriculum.outcome: return, with curriculum.largest_return, goes by returns instead"
+                if "outcome" in type(config.curriculum).model_fields
+                else ""
+            )
             raise ConfigError(
                 f"curriculum.kind: {kind} needs to know whether an episode succeeded, and env.id {config.env.id!r} "
-                "does not say (its steps have no `success`)"
+                f"does not say (its steps have no `success`){others}"
             )
 
     def _refuse_recording(self, curriculum: Curriculum) -> None:

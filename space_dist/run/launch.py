@@ -256,7 +256,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
             if not damage:
                 return before
             for sentence in damage:
-                log.warning("%s; computing it again from the last checkpoint", sentence)
+                log.warning("%s; computing it again from the last checkpoint that is intact", sentence)
         if before.checkpoint is not None and before.format != FORMAT:
             raise ConfigError(
                 f"{ledger.folder} was begun by an earlier version of space_dist (format {before.format} of its files; "

@@ -66,6 +66,11 @@ def asked(address: str, seconds: float = _ASK_SECONDS) -> Literal["answers", "si
 
 def reach(address: str, raise_if_stopped: Callable[[], None]) -> None:
     """Wait until HOST:PORT answers, for 30 s at most; other addresses are Ray's to find. Raises SpaceDistError."""
+    if address.startswith(("http://", "https://")):
+        raise SpaceDistError(
+            "that is the address of a job server, which `grid submit --address` takes; this one is HOST:PORT, "
+            "ray://HOST:PORT or auto"
+        )
     target = address.rpartition("://")[2]
     host, _, port = target.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:

@@ -25,7 +25,7 @@ from space_dist.config.sections import SINKS
 from space_dist.config.tracking_uri import settled_uri
 from space_dist.errors import LedgerError
 from space_dist.experiment.manifest import CELL_ID_DIGITS, MANIFEST, Grid
-from space_dist.ledger import Ledger, Status
+from space_dist.ledger import Ledger, Status, absent
 from space_dist.tracking.grids import GridMirror
 from space_dist.tracking.sinks import Sink, sink_of
 from space_dist.tracking.snapshot import NOTE_TAG, read_snapshot
@@ -93,7 +93,7 @@ def find(paths: Iterable[Path]) -> Found:
     grids: dict[Path, Grid] = {}
     for path in paths:
         if not path.exists():
-            raise LedgerError(f"{path} does not exist")
+            raise absent(path)
         before = len(ledgers) + len(grids)
         if around := _grid_around(path.resolve()):
             grids[around] = Grid(around)

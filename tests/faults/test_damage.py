@@ -213,6 +213,26 @@ def test_emptied_checkpoints_are_not_started_over_in_silence(original: tuple[Any
     assert {path: path.read_bytes() for path in copy.rglob("*.jsonl")} == before
 
 
+def test_a_run_that_is_done_goes_back_as_any_other(original: tuple[Any, Path, Any, Any], copy: Path) -> None:
+    config, _, right, _ = original
+    if Ledger(copy).status().state != "done":
+        return
+    newest, older = Ledger(copy).checkpoint_files()
+    newest.write_bytes(newest.read_bytes()[:100])
+    with pytest.raises(LedgerError, match="is damaged; `train --resume` goes back to the one before it"):
+        Ledger(copy).last_checkpoint()
+    assert resumes_to_the_same_bytes_or_is_refused(config, copy, right)
+    with (copy / METRICS).open("a") as file:
+        file.write("garbage\n")
+    assert resumes_to_the_same_bytes_or_is_refused(config, copy, right)
+    assert older.name < newest.name == Ledger(copy).checkpoint_files()[0].name
+    for path in Ledger(copy).checkpoint_files():
+        path.write_bytes(b"damaged")
+        path.rename(newest)  # leaves one
+    with pytest.raises(LedgerError, match="is damaged; there is no other"):
+        Ledger(copy).last_checkpoint()
+
+
 def test_after_a_fallback_the_status_names_the_checkpoint_that_is_used(copy: Path) -> None:
     newest, older = Ledger(copy).checkpoint_files()
     newest.write_bytes(newest.read_bytes()[:-1])
