@@ -219,7 +219,7 @@ def read_features(path: Path, columns: Sequence[str] = ()) -> tuple[InstanceSet,
 
     All columns but `id` and `columns` are features. Raises ConfigError as `read_csv` does.
     """
-    names = tuple(name for name in named_columns(path) if name not in ("id", *columns))
+    names = tuple(name for name in _named_columns(path) if name not in ("id", *columns))
     if not names:
         raise ConfigError(f"{_shown_path(path)}: row 1 names no feature")
     wide = np.full(len(names), _WIDE)
@@ -229,8 +229,7 @@ def read_features(path: Path, columns: Sequence[str] = ()) -> tuple[InstanceSet,
     return instances, ContextBounds(names, low, np.where(high > low, high, low + np.maximum(1.0, np.abs(low))))
 
 
-def named_columns(path: Path) -> list[str]:
-    """The columns that a CSV file's first line names. Raises ConfigError if it cannot be read."""
+def _named_columns(path: Path) -> list[str]:
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:
@@ -345,6 +344,13 @@ def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], 
     if columns == [""]:
         raise ConfigError(f"row 1 is blank where the columns must be named: {allowed}")
     known, seen = set(expected), set[str]()
+    asked = [name for name in required if name in further and name not in columns]
+    if (
+        asked
+        and (others := [name for name in columns if name not in known])
+        and known.difference(further) <= {*columns}
+    ):
+        raise ConfigError(f"row 1: there is no column {shown(asked[0])}, as was asked for{nearest(asked[0], others)}")
     for column in columns:
         if column not in known:
             missing = sorted(known.difference(columns))

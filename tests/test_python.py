@@ -99,6 +99,19 @@ def test_a_run_shorter_than_its_first_checkpoint_begins_anew(tmp_path: Path) -> 
     assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
+def test_without_its_checkpoints_a_run_gets_no_larger_budget(tmp_path: Path) -> None:
+    section = learner_section("ppo")
+    run = space_dist.train(config_for(tmp_path, section), out=tmp_path / "run", progress=False)
+    for path in (run.folder / "checkpoints").iterdir():
+        path.unlink()
+    before = files(run.folder)
+    long = config_for(tmp_path, section, budget={"steps": 12 * N_STEPS})
+    with pytest.raises(ConfigError, match="its checkpoints were removed, and a larger budget goes on from one of them"):
+        space_dist.train(long, out=run.folder, resume=True, progress=False)
+    assert files(run.folder) == before
+    assert run.status.state == "done"
+
+
 def test_a_longer_run_that_is_interrupted_goes_on(tmp_path: Path) -> None:
     section = learner_section("ppo")
     space_dist.train(config_for(tmp_path, section), out=tmp_path / "run", progress=False)
@@ -302,6 +315,8 @@ def test_a_policy_acts_as_the_run_does(tmp_path: Path) -> None:
     assert policy.values(seen).tolist() == pytest.approx([policy.values(each) for each in seen], abs=1e-6)
     with pytest.raises(ConfigError, match="without its context has 1 numbers, not the shape \\(5, 2\\)"):
         policy.with_context(seen, np.array([0.5]))
+    with pytest.raises(ConfigError, match=r"contexts of shape \(3, 1\) for observations of shape \(5, 1\)"):
+        policy.with_context(plain, np.zeros((3, 1)))
     with pytest.raises(ConfigError, match="contexts of shape"):
         policy.with_context(plain, np.zeros(4))
     with pytest.raises(ConfigError, match="it has no number 1"):

@@ -104,6 +104,8 @@ class ActingPolicy:
                 f"an observation without its context has {own} numbers, not the shape {plain.shape}; the context's "
                 f"{scaled.shape[-1]} are put behind them"
             )
+        if scaled.ndim > 1 and scaled.shape[:-1] != plain.shape[:-1]:
+            raise ConfigError(f"contexts of shape {scaled.shape} for observations of shape {plain.shape}")
         return np.concatenate([plain, np.broadcast_to(scaled, (*plain.shape[:-1], scaled.shape[-1]))], axis=-1)
 
     def _batched(self, observation: Observations) -> tuple[Observations, bool]:

@@ -103,7 +103,7 @@ def line_of_run(name: str, seed: int, progress: Progress) -> str:
     share = progress.steps / max(1, progress.budget_steps)
     return (
         f"{name} s{seed}  {progress.steps:,}/{progress.budget_steps:,} steps ({share:.0%})  "
-        f"{progress.pace}  set {progress.set_size}/{progress.n_instances}  "
+        f"{progress.pace}  set {progress.trained}  "
         f"return train {_number(progress.train_return)} test {_number(progress.test_return)}"
     )
 

@@ -346,8 +346,10 @@ def grid_retry(
             Attempts(run_status.ledger).forgive()
             say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
             forgiven += 1
-    follow_up = "" if not forgiven else f"; `space-dist grid run {place.folder}` or `grid submit` does it"
-    say(f"{forgiven} runs may be tried again{follow_up}")
+    how = f"`space-dist grid run {grid if grid.is_file() else place.folder}` or `grid submit` does it"
+    if not grid.is_file():
+        how += ", as the grid was frozen; what has changed in its YAML file comes in when that file is run"
+    say(f"{forgiven} runs may be tried again{f'; {how}' if forgiven else ''}")
 
 
 def _unreadable(run_status: RunStatus) -> str:

@@ -387,6 +387,6 @@ def _in_words(progress: Progress) -> str:
 
     return (
         f"{progress.steps:,}/{progress.budget_steps:,} steps  {progress.pace}  "
-        f"set {progress.set_size}/{progress.n_instances}  "
+        f"set {progress.trained}  "
         f"return train {number(progress.train_return)} test {number(progress.test_return)}"
     )

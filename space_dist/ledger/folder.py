@@ -173,8 +173,6 @@ class Ledger:
         ]
         done = self.status().state == "done"  # of whose rows a checkpoint covers all
         checks += [functools.partial(self.rows, name, committed_only=not done) for name in ROW_FILES]
-        if self.checkpoint_files():  # who removed them all, of a run that is done, wanted the room
-            checks.append(self.last_checkpoint)
         found = []
         for check in checks:
             try:
@@ -196,10 +194,21 @@ class Ledger:
             with contextlib.suppress(LedgerError, ValueError):
                 return decode_checkpoint(read_whole(self.checkpoints / name))
             name = self.status().checkpoint
-        there = [file.name for file in self.checkpoint_files()]
-        what = "damaged" if name in there else "missing"
-        way_out = "`train --resume` goes back to the one before it" if {*there} - {name} else "there is no other"
+        if name is None:
+            return None
+        what = "damaged" if (self.checkpoints / name).exists() else "missing"
+        way_out = (
+            "`train --resume` goes back to the one before it" if self.has_intact_checkpoint() else "no other is intact"
+        )
         raise LedgerError(f"the last checkpoint in {self.checkpoints}, {name}, is {what}; {way_out}")
+
+    def has_intact_checkpoint(self) -> bool:
+        """Whether one at least can be read, whichever `status.json` names."""
+        for file in self.checkpoint_files():
+            with contextlib.suppress(LedgerError, ValueError):
+                decode_checkpoint(read_whole(file))
+                return True
+        return False
 
     def abandoned(self, status: Status) -> bool:
         """Whether the run was left behind by a process that is gone, and could not say why."""

@@ -18,7 +18,7 @@ from space_dist.curricula.making import make_curriculum
 from space_dist.curricula.replay import Replay
 from space_dist.envs.spec import EnvironmentSpec, read_spec
 from space_dist.errors import ConfigError, about, nearest
-from space_dist.instances import InstanceSet, named_columns, read_csv, refuse_overlap, refuse_padding
+from space_dist.instances import InstanceSet, read_csv, refuse_overlap, refuse_padding
 from space_dist.learner import (
     CoupledLearner,
     Ensemble,
@@ -96,11 +96,6 @@ class Blueprint:
         """
         files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.columns_read
         with about("instances.train"):
-            if wanted := [name for name in columns if name not in (there := named_columns(files.train))]:
-                raise ConfigError(
-                    f"{files.train} has no column {wanted[0]!r}, which the curriculum reads"
-                    f"{nearest(wanted[0], (name for name in there if name not in ('id', *bounds.names)))}"
-                )
             train = read_csv(files.train, bounds, columns)
         with about("instances.test"):
             test = read_csv(files.test, bounds, columns, if_there=True)

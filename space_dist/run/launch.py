@@ -251,8 +251,13 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
         before = writer.status = _status_before(ledger)
         earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
     if before is not None:
+        if earlier is not None and before.checkpoint is not None and not ledger.checkpoint_files():
+            raise ConfigError(
+                f"{ledger.folder}: its checkpoints were removed, and a larger budget goes on from one of them: use "
+                "--out DIR for another run. With `init_from` it starts from this one's policy"
+            )
         if before.has_reached(pause_at) and earlier is None:
-            damage = ledger.damage()
+            damage = ledger.damage() or _damage_behind(ledger)
             if not damage:
                 return before
             for sentence in damage:
@@ -283,6 +288,22 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
     ledger.stop_file.unlink(missing_ok=True)
     writer.set_status(status)
     return status
+
+
+def _damage_behind(ledger: Ledger) -> list[str]:
+    """What is damaged of a run whose results are whole: its last checkpoint, where another can take its place.
+
+    Who removed all checkpoints of a run that is done wanted the room.
+    """
+    if not ledger.checkpoint_files():
+        return []
+    try:
+        ledger.last_checkpoint()
+    except LedgerError as error:
+        if ledger.has_intact_checkpoint():
+            return [str(error)]
+        log.warning("%s; the results of %s are whole: its checkpoints may be removed", error, ledger.folder)
+    return []
 
 
 def _also_decide(config: RunConfig) -> list[str]:

@@ -82,6 +82,11 @@ class Progress:
     test_return: float | None = None
 
     @property
+    def trained(self) -> str:
+        """`27/100`, or a dash for the 27 until curricula that draw have drawn."""
+        return f"{self.set_size or '—'}/{self.n_instances}"
+
+    @property
     def pace(self) -> str:
         """`5,012/s`, or a dash until it can be told."""
         return f"{self.steps_per_second:,.0f}/s" if self.steps_per_second > 0 else "—/s"

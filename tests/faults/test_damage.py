@@ -229,8 +229,11 @@ def test_a_run_that_is_done_goes_back_as_any_other(original: tuple[Any, Path, An
     for path in Ledger(copy).checkpoint_files():
         path.write_bytes(b"damaged")
         path.rename(newest)  # leaves one
-    with pytest.raises(LedgerError, match="is damaged; there is no other"):
+    with pytest.raises(LedgerError, match="is damaged; no other is intact"):
         Ledger(copy).last_checkpoint()
+    before = (copy / "status.json").read_bytes()
+    assert launch(config, copy, resume=True, stop=StopRequests()).already_done
+    assert (copy / "status.json").read_bytes() == before
 
 
 def test_after_a_fallback_the_status_names_the_checkpoint_that_is_used(copy: Path) -> None:
