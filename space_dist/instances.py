@@ -46,10 +46,7 @@ class ContextBounds:
         _check_names(self.names)
         low, high = (np.array(side, dtype=np.float64) + 0.0 for side in (self.low, self.high))
         if low.shape != (len(self.names),) or high.shape != low.shape:
-            raise ConfigError(
-                f"bounds of shapes {low.shape} and {high.shape} for {len(self.names)} names of features: "
-                f"{', '.join(self.names)}"
-            )
+            raise ConfigError(f"bounds of shapes {low.shape} and {high.shape} for {len(self.names)} features")
         with np.errstate(over="ignore", invalid="ignore"):
             usable = np.isfinite(high - low) & (low < high)
         if not usable.all():

@@ -287,6 +287,14 @@ class NamesTwice(Honest):
     context_names = ("gain", "gain")
 
 
+class OneName(Honest):
+    context_names = ("gain",)
+
+
+class Word(Honest):
+    context_names = "ab"
+
+
 class NoLength(Honest):
     horizon = property()
 

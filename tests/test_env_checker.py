@@ -53,6 +53,8 @@ FAULTS = {
     "NoContextSpace": "has no `context_space`",
     "EndlessBounds": "its context_space cannot be used: feature 'gain' has bounds [-inf, inf]",
     "NamesTwice": "the feature 'gain' is named twice",
+    "OneName": "its context_names must be a tuple of 2 names, one for each number of its context_space, not",
+    "Word": "its context_names must be a tuple of 2 names",
     "NoLength": "the length of its episodes is unknown",
     "the_same_one": "returned the same environment twice",
     "make": "called with a number of slots and returned one gymnasium.Env",

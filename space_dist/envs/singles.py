@@ -166,9 +166,15 @@ def _bounds(env: gym.Env[Any, Any], space: spaces.Box) -> ContextBounds:
     # The shortest decimals: a float32 bound of 0.1 means 0.1, not 0.10000000149.
     low, high = (np.array([float(str(bound)) for bound in side]) for side in (space.low, space.high))
     try:
-        names = tuple(str(name) for name in env.get_wrapper_attr("context_names"))
+        told = env.get_wrapper_attr("context_names")
     except AttributeError:
-        names = tuple(f"feature_{index}" for index in range(len(low)))
+        told = [f"feature_{index}" for index in range(len(low))]
+    if not isinstance(told, list | tuple) or len(told) != len(low):
+        raise ConfigError(
+            f"its context_names must be a tuple of {len(low)} names, one for each number of its context_space, not "
+            f"{str(told)[:80]!r}"
+        )
+    names = tuple(map(str, told))
     try:
         return ContextBounds(names, low, high)
     except ConfigError as error:
