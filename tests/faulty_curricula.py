@@ -383,6 +383,11 @@ class LogsArrays(Honest):
         return new, selection, {"scores": new.scores}
 
 
+class Raises(Honest):
+    def step(self, state: Any, feedback: Feedback) -> Any:
+        raise KeyError("no such score")
+
+
 class ForgetsToAsk(Honest):
     def scored(self, state: Any, feedback: Feedback) -> NDArray[np.float64]:
         return state.scores + feedback.episodes.returns.sum()  # type: ignore[union-attr, no-any-return]

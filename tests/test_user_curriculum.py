@@ -123,3 +123,11 @@ def test_an_answer_that_breaks_the_protocol_ends_the_run_with_a_sentence(example
         assert status.state == "failed"
         assert status.message is not None
         assert words in status.message
+
+
+def test_what_it_raises_is_told_with_where(example: Path) -> None:
+    config = chosen('curriculum={kind: custom, import: "tests.faulty_curricula:Raises"}', "budget.steps=1024")
+    where = "KeyError: 'no such score' (in curriculum.import 'tests.faulty_curricula:Raises': step())"
+    with pytest.raises(SpaceDistError, match=re.escape(f"the run failed: {where}. The traceback is in")):
+        launch(config, example / "run", resume=True, stop=StopRequests())
+    assert Ledger(example / "run").status().message == where

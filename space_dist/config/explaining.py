@@ -107,7 +107,8 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
             return f"{where}: {key}: unknown key; keys stand in sections: {' or '.join(f'{s}.{key}' for s in sections)}"
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
     if kind == "missing":
-        return f"{where}: {key}: this key is required"
+        way_out = f"; `space-dist config schema {path[-1]}` explains it" if root is RunConfig else ""
+        return f"{where}: {key}: this key is required{way_out}"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tags = [tag.strip("' ") for tag in str(context.get("expected_tags") or _tags(path[0])).split(",")]
         given_kind = given.get("kind") if isinstance(given, dict) else given

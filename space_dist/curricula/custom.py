@@ -94,7 +94,7 @@ class Custom(Curriculum):
 
     where: what sentences about it begin with.
     Raises ConfigError, here and from every method, at the first answer that breaks the protocol. What the curriculum
-    itself raises passes through.
+    itself raises passes through, with a note of where.
     """
 
     def __init__(
@@ -117,12 +117,13 @@ class Custom(Curriculum):
         """See `Curriculum`. The numbers hold at least `size`, how many instances are selected."""
         try:
             answer: Any = self._own.step(state, feedback)
-        except (AttributeError, TypeError) as error:
+        except Exception as error:
             if feedback.episodes is None and "NoneType" in str(error):
                 self._refuse(
                     f"step() fails: {type(error).__name__}: {str(error)[:200]}. feedback.episodes is None, for the "
                     "class does not say that it wants them: wants = Wants(episodes=True)"
                 )
+            error.add_note(f"{self._where}: step()")
             raise
         if not isinstance(answer, tuple) or len(answer) != 3:
             self._refuse("step() must return (state, selection, numbers for the log)")
