@@ -123,7 +123,7 @@ class Custom(Curriculum):
                     f"step() fails: {type(error).__name__}: {str(error)[:200]}. feedback.episodes is None, for the "
                     "class does not say that it wants them: wants = Wants(episodes=True)"
                 )
-            error.add_note(f"{self._where}: step()")
+            error.add_note(f"in {self._where}: step()")
             raise
         if not isinstance(answer, tuple) or len(answer) != 3:
             self._refuse("step() must return (state, selection, numbers for the log)")

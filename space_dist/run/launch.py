@@ -497,7 +497,7 @@ def _failures_noted(writer: RunWriter) -> Iterator[None]:
         raise
     except BaseException as error:  # a user's environment may raise anything
         log.error("%s", traceback.format_exc())  # the traceback is for the log alone
-        where = "".join(f" (in {note})" for note in getattr(error, "__notes__", ()))
+        where = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
         what = f"{type(error).__name__}: {error}{where}"
         _note_failure(writer, what)
         raise SpaceDistError(f"the run failed: {what[:500]}. The traceback is in {writer.ledger.log}") from error
