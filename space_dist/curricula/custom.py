@@ -117,7 +117,7 @@ class Custom(Curriculum):
         """See `Curriculum`. The numbers hold at least `size`, how many instances are selected."""
         try:
             answer: Any = self._own.step(state, feedback)
-        except Exception as error:
+        except Exception as error:  # somebody else's code may raise anything
             if feedback.episodes is None and "NoneType" in str(error):
                 self._refuse(
                     f"step() fails: {type(error).__name__}: {str(error)[:200]}. feedback.episodes is None, for the "
