@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+import io
 import math
 import re
 import shutil
@@ -15,7 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from space_dist.cli.runs import print_grid_report
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
@@ -273,6 +276,15 @@ def test_a_threshold_within_the_noise_of_step_0_is_untestable(tmp_path: Path) ->
         assert found.untestable == "untestable: within noise of step 0 (up to 5.968)"
     assert all(found.reach is not None for found in compare(cells, cells[1]))
 
+    report = build_grid_report(grid)
+    assert [row["steps to the threshold"] for row in report.table] == ["untestable", "untestable"]
+    reason = "Untestable steps to the threshold, within noise of step 0: k=1 (up to 5.968), k=2 (up to 5.968)."
+    assert reason in report.remarks
+    shown = io.StringIO()
+    print_grid_report(report, Console(file=shown, width=80))
+    assert reason in " ".join(shown.getvalue().split())
+    assert not any("ntestable" in line for line in build_grid_report(grid, baseline="k=2").remarks)
+
 
 # ---- odd grids ------------------------------------------------------------------------------------------------------
 
@@ -458,6 +470,9 @@ def test_many_cells_are_drawn_in_panels(tmp_path: Path) -> None:
     report = build_grid_report(grid)
     assert "grey: the baseline" in report.markdown
     assert report.table[3]["steps to the threshold"] == "untestable"
+    assert report.remarks[-1].startswith(
+        "Untestable steps to the threshold, one seed shows no noise at step 0: a=1 b=1, a=1 b=2, "
+    )
     assert report.table[3]["test return, IQM [95 %]"] == "3.000 [—] (1/1)"
 
 

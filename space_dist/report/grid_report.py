@@ -196,7 +196,7 @@ def build_grid_report(
     table = [
         _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
     ]
-    return GridReport(folder, summary, table, remarks, markdown)
+    return GridReport(folder, summary, table, remarks + _untestable(cells, compared), markdown)
 
 
 def _pictures_of(report: Path) -> list[str]:
@@ -261,6 +261,21 @@ def _remarks(manifest: Manifest, cells: Sequence[CellRuns], compared: Sequence[C
     peculiar = [line for cell in cells for line in caveats(cell.configuration)]
     more = [f"{len(peculiar) - MAX_LISTED:,} more remarks of this kind."] if len(peculiar) > MAX_LISTED else []
     return lines + peculiar[:MAX_LISTED] + more
+
+
+def _untestable(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[str]:
+    """Why steps to the threshold are untestable: the table for a terminal has no room for it."""
+    of_reason: dict[str, list[str]] = {}
+    for cell, comparison in zip(cells, compared, strict=True):
+        word, _, reason = comparison.untestable.partition(": ")
+        if reason:
+            what, _, bound = reason.partition(" (")
+            names = of_reason.setdefault(f"{word.capitalize()} steps to the threshold, {what}", [])
+            names.append(f"{cell.label} ({bound}" if bound else cell.label)
+    return [
+        f"{reason}: {', '.join(names[:MAX_LISTED])}{', ...' if len(names) > MAX_LISTED else ''}."
+        for reason, names in of_reason.items()
+    ]
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------
