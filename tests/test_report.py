@@ -32,6 +32,7 @@ from space_dist.report import (
     group,
     interquartile_mean,
     load_run,
+    read_config,
     summarise,
 )
 from space_dist.report.figures import curriculum_shares
@@ -386,13 +387,40 @@ def test_the_same_seed_twice_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_configurations_of_one_name_are_told_apart(tmp_path: Path) -> None:
+def relabelled(folder: Path, *changes: dict[str, Any]) -> list[str]:
+    """The labels of finished runs of one name, which have these sections in their configs."""
+    for number, sections in enumerate(changes):
+        ledger = finished_run(folder / f"r{number}", 1.0)
+        written(ledger, "config.yaml", to_yaml({**read_config(ledger), **sections}))
+    return [found.label for found in group([load_run(ledger) for ledger in find_ledgers([folder])])]
+
+
+def test_configurations_of_one_name_are_told_apart_by_their_settings(tmp_path: Path) -> None:
+    """A setting that one kind alone has is named where two of that kind differ in it; defaults of a kind are not."""
+    space, round_robin = {"curriculum": {"kind": "space"}}, {"curriculum": {"kind": "round_robin"}}
+    faster = {"curriculum": {"kind": "space", "eta": 0.2}}
+    assert relabelled(tmp_path / "kinds", faster, space, round_robin) == [
+        "space kind=space eta=0.2", "space kind=space eta=0.1", "space kind=round_robin",
+    ]  # fmt: skip
+    given = {"env": {"id": "space_dist/PointMass-v0", "kwargs": {"horizon": 50}}}
+    assert relabelled(tmp_path / "one", space, given) == ["space", "space horizon=50"]
+    a2c = {"learner": {"kind": "a2c", "gamma": 0.9, "n_steps": 512, "learning_rate": 0.123456789, "ent_coef": 0.01}}
+    assert relabelled(tmp_path / "long", space, round_robin | a2c) == [
+        "space curriculum.kind=space learner.kind=ppo", "space curriculum.kind=round_robin learner.kind=a2c",
+    ]  # fmt: skip
+
+
+def test_a_hash_tells_apart_what_no_short_setting_does(tmp_path: Path) -> None:
     finished_run(tmp_path / "a", 1.0, eta=0.1)
     finished_run(tmp_path / "b", 1.0, eta=0.2)
     finished_run(tmp_path / "c", 1.0, eta=0.2, n=5, seed=1)  # other instances: another configuration too
     labels = [row["configuration"] for row in build_report(find_ledgers([tmp_path]), tmp_path / "out").table]
+    assert labels[0] == "space eta=0.1"
+    assert all(re.fullmatch(r"space eta=0\.2 [0-9a-f]{6}", label) for label in labels[1:])
     assert len(set(labels)) == 3
-    assert all(label.startswith("space ") for label in labels)
+    long = relabelled(tmp_path / "long", *({"learner": {"kind": "ppo", "net_arch": [n] * 30}} for n in (32, 64)))
+    assert all(re.fullmatch(r"space [0-9a-f]{6}", label) for label in long)
+    assert len(set(long)) == 2
 
 
 def test_runs_of_equal_settings_are_one_configuration_whatever_they_are_called(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from space_dist.experiment.endings import Evidence, why_ended
 from space_dist.experiment.manifest import Cell, Grid, Manifest
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.report.figures import HeatMap
-from space_dist.report.load import SPLITS, Configuration, FloatArray, Run, load_run
+from space_dist.report.load import SPLITS, Configuration, FloatArray, Run, load_run, short_names, word
 from space_dist.report.statistics import (
     Interval,
     Reach,
@@ -271,11 +271,6 @@ def _is_of_task(key: str) -> bool:
     return key.partition(".")[0] in ("env", "instances") and key != "env.context_visible"
 
 
-def word(value: Any) -> str:
-    """A setting's value for people."""
-    return clean(value if isinstance(value, str) else json.dumps(value))
-
-
 def varying(cells: Sequence[CellRuns]) -> list[str]:
     """The settings in which cells differ, in the grid's order."""
     keys = dict.fromkeys(key for cell in cells for key in cell.settings)
@@ -283,12 +278,6 @@ def varying(cells: Sequence[CellRuns]) -> list[str]:
         key for key in keys
         if len({json.dumps(cell.settings[key]) if key in cell.settings else "" for cell in cells}) > 1
     ]  # fmt: skip
-
-
-def short_names(keys: Sequence[str]) -> dict[str, str]:
-    """Each key's last part, where that is unique."""
-    ends = [key.rpartition(".")[2] for key in keys]
-    return {key: clean(end if ends.count(end) == 1 else key) for key, end in zip(keys, ends, strict=True)}
 
 
 def grouped(

@@ -26,6 +26,7 @@ Split = Literal["test", "train"]
 
 MEASURES: Final = ("return", "discounted_return", "length", "success")
 _GENERATED: Final = -1  # the id of every context that was generated
+_MAX_DIFFERENCE: Final = 60  # characters of the settings that a label names
 SPLITS: Final[tuple[Split, ...]] = ("test", "train")
 
 
@@ -305,8 +306,8 @@ def _foreign(instance_ids: IntArray, trained: Sequence[IntArray]) -> tuple[int, 
 def group(runs: Sequence[Run]) -> list[Configuration]:
     """The configurations in the order of their first run: runs of equal settings, whatever they are called.
 
-    Where a seed is there twice, their names tell configurations apart. Raises ConfigError if a seed is there twice
-    under one name.
+    Where a seed is there twice, their names tell configurations apart; those of one name, the settings in which they
+    differ. Raises ConfigError if a seed is there twice under one name.
     """
     group: dict[str, list[Run]] = {}
     for run in runs:
@@ -318,11 +319,67 @@ def group(runs: Sequence[Run]) -> list[Configuration]:
             parts.append((" + ".join(names), identity, alike))
         else:
             parts += [(name, identity, [run for run in alike if run.status.name == name]) for name in names]
-    names = [name for name, _, _ in parts]
+    of_name: dict[str, dict[str, Run]] = {}
+    for name, identity, alike in parts:
+        of_name.setdefault(name, {})[identity] = alike[0]
+    told = {name: _told_apart(found) if len(found) > 1 else {} for name, found in of_name.items()}
     return [
-        Configuration(name if names.count(name) == 1 else f"{name} {identity[:6]}", _by_seed(alike))
+        Configuration(f"{name} {told[name].get(identity, '')}".rstrip(), _by_seed(alike))
         for name, identity, alike in parts
     ]
+
+
+def _told_apart(runs: Mapping[str, Run]) -> dict[str, str]:
+    """By identity, what tells a run from the others: the settings in which they differ, as `kappa=2 eta=0.05`.
+
+    Where that is too long, the kinds alone. The start of its identity stands behind what others have, too, as where
+    instances differ. Nothing, where it merely lacks a setting that the others have.
+    """
+    settings = [_settings(run) for run in runs.values()]
+    keys = [key for key in dict.fromkeys(key for one in settings for key in one) if _differs(key, settings)]
+    kinds = [key for key in keys if key.endswith(".kind")]
+    texts = _texts(settings, [*kinds, *(key for key in keys if key not in kinds)])
+    if max(map(len, texts)) > _MAX_DIFFERENCE:
+        texts = _texts(settings, kinds)
+    shown = [text if len(text) <= _MAX_DIFFERENCE else "" for text in texts]
+    return {
+        identity: text if shown.count(text) == 1 else f"{text} {identity[:6]}".strip()
+        for identity, text in zip(runs, shown, strict=True)
+    }
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    """What decides its results and can be read in its config, defaults included, sections taken apart."""
+    try:
+        config: Mapping[str, Any] = configs.parse(run.config, str(run.ledger.config)).model_dump(mode="json")
+    except ConfigError:  # of another version's schema
+        config = run.config
+    left_out = {"seed", "instances", *configs.NOT_IDENTITY}  # instances: each run calls its own copy the same
+    return dict(configs.flattened({key: value for key, value in config.items() if key not in left_out}))
+
+
+def _differs(key: str, settings: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a setting is another one in some; that other kinds of a section lack it says nothing but their kind."""
+    kind = f"{key.partition('.')[0]}.kind"
+    having = {str(one.get(kind)) for one in settings if key in one}
+    lacking = {str(one.get(kind)) for one in settings if key not in one}
+    return len({word(one[key]) for one in settings if key in one}) > 1 or bool(having & lacking)
+
+
+def _texts(settings: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[str]:
+    names = short_names(keys)
+    return [" ".join(f"{names[key]}={word(one[key])}" for key in keys if key in one) for one in settings]
+
+
+def word(value: Any) -> str:
+    """A setting's value for people."""
+    return configs.clean(value if isinstance(value, str) else json.dumps(value, default=str))
+
+
+def short_names(keys: Sequence[str]) -> dict[str, str]:
+    """Each key's last part, where that is unique."""
+    ends = [key.rpartition(".")[2] for key in keys]
+    return {key: configs.clean(end if ends.count(end) == 1 else key) for key, end in zip(keys, ends, strict=True)}
 
 
 def _by_seed(runs: Sequence[Run]) -> tuple[Run, ...]:
