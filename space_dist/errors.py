@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Final
+
+_SECTION_AND_KEY: Final = re.compile(r"[a-z]\w*(?:\.\w+)+")
+_SECTION: Final = re.compile(r"(?<![\w.])[a-z]\w*(?=:| = )")
 
 
 class SpaceDistError(Exception):
@@ -63,10 +69,27 @@ def nearest(word: str, allowed: Iterable[str]) -> str:
 
 
 @contextlib.contextmanager
-def about(where: str) -> Iterator[None]:
-    """Say where a fault lies: the file or key goes before its sentence, unless it is there already."""
+def about(where: str, changes: Mapping[str, str] = MappingProxyType({})) -> Iterator[None]:
+    """Say where a fault lies: the file or key goes before its sentence, unless it is there already.
+
+    changes: see `with_changes`.
+    """
     try:
         yield
     except ConfigError as error:
         text = str(error)
-        raise ConfigError(text if text.startswith((where, "--set ")) else f"{where}: {text}") from error
+        there = text.startswith((where, "--set "))
+        raise ConfigError(text if there else f"{with_changes(where, text, changes)}: {text}") from error
+
+
+def with_changes(where: str, sentence: str, changes: Mapping[str, str]) -> str:
+    """`FILE with --set learner.n_steps=1000`: a file, and those changes made to it whose keys the sentence names.
+
+    changes: by key (of a section, or of something in one), how each was told.
+    """
+    sections, keys = _SECTION.findall(sentence), _SECTION_AND_KEY.findall(sentence)
+    named = [
+        told for change, told in changes.items()
+        if change in sections or any(f"{key}.".startswith(f"{change}.") or change.startswith(f"{key}.") for key in keys)
+    ]  # fmt: skip
+    return " with ".join([where, " ".join(named)]) if named else where

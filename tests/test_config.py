@@ -312,12 +312,31 @@ def test_several_faults_are_told_together() -> None:
 
 
 def test_settings_that_do_not_go_together() -> None:
-    text = refusal(SPACE, "rollout.shards=3")
-    assert str(SPACE) in text
+    text = refusal(SPACE, "rollout.shards=3", "seed=3")
+    assert text.startswith(f"{SPACE} with --set rollout.shards=3: learner.n_steps = 2048 ")
     for part in ("learner.n_steps = 2048", "rollout.shards * rollout.slots = 3 * 4 = 12"):
         assert part in text
     text = refusal(SPACE, "budget.steps=2047")
     assert "budget.steps = 2047 is less than one update of learner.n_steps = 2048" in text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["seed=3", "learner.n_steps=1000", "learner.gamma=0.9"], "--set learner.n_steps=1000"),
+        (["learner={kind: ppo, n_steps: 1000}"], "--set learner={kind: ppo, n_steps: 1000}"),
+        (["budget.steps=2000", "learner.n_steps=4000"], "--set budget.steps=2000 --set learner.n_steps=4000"),
+        (["device=cuda"], "--set device=cuda"),
+        (["learner.kind=trpo"], "--set learner.kind=trpo"),  # the file has keys of ppo's
+        (["curriculum.eta=0.2", "curriculum.kappa=1", "curriculum.growth=multiply"],
+         "--set curriculum.kappa=1 --set curriculum.growth=multiply"),
+    ],
+)  # fmt: skip
+def test_a_file_that_an_override_makes_wrong_is_named_with_it(overrides: list[str], named: str, tmp_path: Path) -> None:
+    for line in refusal(SPACE, *overrides).splitlines():
+        assert line.startswith(f"{SPACE} with {named}: ")
+    faulty = written(tmp_path, replaced(plain(SPACE), "learner.n_steps", 1000))
+    assert refusal(faulty, "learner.gamma=0.9").startswith(f"{faulty}: learner.n_steps = 1000 ")
 
 
 @pytest.mark.parametrize(

@@ -203,8 +203,8 @@ def config_check(
     from space_dist import config as configs
     from space_dist.run.building import Blueprint
 
-    run = configs.load(config, list(overrides or []), to_check=True)
-    with about(str(config)):
+    run = configs.load(config, overrides or (), to_check=True)
+    with about(str(config), configs.origins(overrides or ())):
         blueprint = Blueprint.of(run)
         blueprint.setup(*blueprint.instances())
     print(configs.dump(run), end="")

@@ -52,9 +52,10 @@ def train(
 
     options = [("--workers", "resources.workers", workers), ("--seed", "seed", seed)]
     settings = [from_option(*option) for option in options if option[-1] is not None]
-    run = configs.load(config, [*(overrides or ()), *settings])
+    changes = [*(overrides or ()), *settings]
+    run = configs.load(config, changes)
     folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
-    with about(str(config)), _display(run.name, run.seed) as (observe, waiting):
+    with about(str(config), configs.origins(changes)), _display(run.name, run.seed) as (observe, waiting):
         outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe, waiting=waiting)
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"

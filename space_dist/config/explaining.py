@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from space_dist.config.quoting import short
 from space_dist.config.run import RunConfig
 from space_dist.config.tracking_uri import UriError
-from space_dist.errors import nearest
+from space_dist.errors import nearest, with_changes
 
 # What scripts with SB3 say, and where a config says it.
 _SB3_NAMES = {
@@ -97,6 +97,8 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         origin for name, origin in origins.items() if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
     )
     where = next(related, source)
+    if where == source and path and f"{path[0]}.kind" in origins:  # by which a section has other keys than the file's
+        where = f"{source} with {origins[f'{path[0]}.kind']}"
     kind, given = fault["type"], fault.get("input")
     context = fault.get("ctx", {})
     if kind == "extra_forbidden":
@@ -119,7 +121,13 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if kind == "value_error":
         message = str(context.get("error", fault["msg"]))
         if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
-            return f"{where}: {key}: {message}" if key else f"{where}: {message}"
+            if not key:
+                return f"{with_changes(source, message, origins)}: {message}"
+            named = [
+                told for name, told in origins.items()
+                if name.startswith(f"{key}.") and re.search(rf"\b{re.escape(name[len(key) + 1:])}\b", message)
+            ]  # fmt: skip
+            return f"{' with '.join([source, ' '.join(named)]) if named else where}: {key}: {message}"
         # A value is not repeated here: a URI may hold a password.
         if isinstance(context.get("error"), UriError):
             return f"{where}: {key}: {message}"

@@ -38,8 +38,12 @@ def load(path: Path, overrides: Sequence[str] = (), *, to_check: bool = False) -
     data = read(path, to_check=to_check)
     for override in overrides:
         apply_override(data, override)
-    origins = {override.partition("=")[0].strip(): told(override) for override in overrides}
-    return parse(data, str(path), origins)
+    return parse(data, str(path), origins(overrides))
+
+
+def origins(overrides: Sequence[str]) -> dict[str, str]:
+    """By the key that it sets, each override as sentences name it."""
+    return {override.partition("=")[0].strip(): told(override) for override in overrides}
 
 
 def read(path: Path, *, to_check: bool = False) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence
         label = label_of(point, config.axes())
         where = f"{path}, cell {label!r}"
         resolved = scaling.shorter(resolved_cell(config.name, label, data, where, changes), scale, where)
-        cell, run_steps = frozen_cell(config.resources, resolved, point, label, where, files, specs)
+        cell, run_steps = frozen_cell(config.resources, resolved, point, label, where, files, specs, changes)
         if cell.id in cells:
             raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
         cells[cell.id] = cell
@@ -119,20 +119,19 @@ def resolved_cell(
         data.pop(key, None)
     # The name of a run may become a file's.
     name = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in f"{grid}_{label}")[:100]
-    origins = {change.partition("=")[0].strip(): configs.told(change) for change in changes}
-    return configs.parse({**data, "name": name}, where, origins)
+    return configs.parse({**data, "name": name}, where, configs.origins(changes))
 
 
 def frozen_cell(
     resources: RunResources, config: RunConfig, point: dict[str, Any], label: str, where: str, files: InstanceFiles,
-    specs: dict[str, EnvironmentSpec],
+    specs: dict[str, EnvironmentSpec], changes: Sequence[str] = (),
 ) -> tuple[Cell, int]:  # fmt: skip
     """A cell, and the environment steps of each of its runs; what it reads goes into `files`.
 
-    point: its settings by axis. specs: of environments that were looked at before, by the section of a config. Raises
-    ConfigError if it cannot work.
+    point: its settings by axis. specs: of environments that were looked at before, by the section of a config.
+    changes: made to it, for errors. Raises ConfigError if it cannot work.
     """
-    with about(where):
+    with about(where, configs.origins(changes)):
         section = config.env.model_dump_json()
         blueprint = Blueprint.of(config, specs.get(section), can_share=resources.workers == 0)
         config, specs[section] = blueprint.config, blueprint.spec

@@ -281,8 +281,7 @@ def load_profile(path: Path | None, overrides: Sequence[str] = ()) -> Profile:
     data: dict[str, Any] = {} if path is None else configs.read_yaml(configs.located(path))
     for override in overrides:
         configs.apply_override(data, override)
-    origins = {override.partition("=")[0].strip(): configs.told(override) for override in overrides}
-    return configs.check(Profile, data, str(path or "the default profile"), origins)
+    return configs.check(Profile, data, str(path or "the default profile"), configs.origins(overrides))
 
 
 def seconds(time: str | int | None) -> int | None:
