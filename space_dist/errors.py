@@ -34,7 +34,7 @@ class UnreadableError(LedgerError):
 
 
 class NotPlannedError(LedgerError):
-    """The grid or search that a user names was never begun below that root: another command, or root, is meant."""
+    """The run, grid or search that a user names was never begun there: another name, command, or root, is meant."""
 
     exit_code = 2  # 1 would say that runs of it have failed
 

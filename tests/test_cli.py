@@ -423,7 +423,11 @@ def test_evaluate_without_a_run_is_an_error(
     more = {"evaluate": ("--instances", TEST), "explain": ("--iteration", 1), "export-sb3": (), "fork": ("--at", 1)}
     for command, options in {**more, "render": ("--out", "there")}.items():
         code, _, error = run(capsys, command, "my_rn", *options)
-        assert (code, "my_rn does not exist; did you mean 'my_run'?" in error.replace("\n", "")) == (1, True)
+        assert (code, "my_rn does not exist; did you mean 'my_run'?" in error.replace("\n", "")) == (2, True)
+    for command in ("report", "sync"):
+        for named, said in (("my_rn", "my_rn is neither here nor"), (tmp_path / "my_rn", "my_rn does not exist")):
+            code, _, error = run(capsys, command, named)
+            assert (code, said in error.replace("\n", "")) == (2, True)
 
 
 def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

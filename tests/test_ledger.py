@@ -19,7 +19,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from space_dist.errors import LedgerError
+from space_dist.errors import LedgerError, NotPlannedError
 from space_dist.ledger import (
     METRICS,
     ROW_FILES,
@@ -218,7 +218,7 @@ def test_a_newer_format_is_named(ledger: Ledger, monkeypatch: pytest.MonkeyPatch
 
 
 def test_ledgers_are_found_below_folders_each_once(tmp_path: Path) -> None:
-    with pytest.raises(LedgerError, match="does not exist"):
+    with pytest.raises(NotPlannedError, match="does not exist"):
         find_ledgers([tmp_path / "missing"])
     with pytest.raises(LedgerError, match="no run found"):
         find_ledgers([tmp_path])

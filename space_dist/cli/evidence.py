@@ -31,9 +31,9 @@ def fork(
 ) -> None:
     """Write a grid that goes on from one moment of a run: as it was, and otherwise, from the same bits."""
     from space_dist.grid.forking import forked
-    from space_dist.ledger import Ledger
+    from space_dist.ledger import Ledger, there
 
-    place = Ledger(run).folder / "fork.yaml" if out is None else out
+    place = Ledger(there(run)).folder / "fork.yaml" if out is None else out
     runs = forked(run, at, set or (), seeds, place)
     say(f"{place}: {runs} runs, bit for bit the same as {run} until {at:,} steps. Next: space-dist grid run {place}")
 

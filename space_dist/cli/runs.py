@@ -80,7 +80,7 @@ def evaluate(
     from space_dist.config import located
     from space_dist.envs import KnowsOptimum, unwrapped
     from space_dist.instances import read_csv
-    from space_dist.ledger import Ledger
+    from space_dist.ledger import Ledger, there
     from space_dist.rollout import Trial
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.rollout.policy import policies_of
@@ -88,7 +88,7 @@ def evaluate(
     from space_dist.run.launch import policy_of, stored_config
     from space_dist.seeding import Purpose, episode_seeds
 
-    ledger = Ledger(run)
+    ledger = Ledger(there(run))
     status = ledger.status()
     if out is not None:
         if out.resolve() == Path(located(instances)).resolve():
@@ -141,12 +141,12 @@ def explain(
 ) -> None:
     """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 13)."""
     from space_dist.instances import read_csv
-    from space_dist.ledger import Ledger
+    from space_dist.ledger import Ledger, there
     from space_dist.report.decisions import explain as explain_decision
     from space_dist.run.building import spec_of
     from space_dist.run.launch import stored_config
 
-    ledger = Ledger(run)
+    ledger = Ledger(there(run))
     ledger.status()
     config = stored_config(ledger)
     ledger.read(ledger.instances("train"))
@@ -165,11 +165,11 @@ def export_sb3(
     ] = None,
 ) -> None:
     """Write a run's policy as a zip that Stable-Baselines3 loads."""
-    from space_dist.ledger import Ledger
+    from space_dist.ledger import Ledger, there
     from space_dist.run.launch import stored_config
     from space_dist.sb3.export import export_sb3 as export
 
-    ledger = Ledger(run)
+    ledger = Ledger(there(run))
     ledger.status()
     config = stored_config(ledger)
     for path, what in export(ledger, out or Path(f"{config.name}_s{config.seed}.zip")):

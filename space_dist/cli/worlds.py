@@ -45,7 +45,7 @@ def render(
     ] = None,
 ) -> None:
     """Draw what a run's policy does: a GIF for each instance, and trajectories side by side."""
-    from space_dist.ledger import Ledger
+    from space_dist.ledger import Ledger, there
     from space_dist.run.render import draw_run
 
     ids = None
@@ -54,5 +54,5 @@ def render(
             ids = [int(one) for one in instances.split(",")]
         except ValueError:
             raise ConfigError(f"--instances {instances!r} must be ids, separated by commas: 0,5,9") from None
-    for path, what in draw_run(Ledger(run), out, ids):
+    for path, what in draw_run(Ledger(there(run)), out, ids):
         say(f"{path}: {what}")

@@ -39,7 +39,7 @@ from space_dist.ledger.checkpoint import (
     encode_arrays,
     encode_checkpoint,
 )
-from space_dist.ledger.folder import GIVEN, Ledger, State, Status, absent, find_ledgers
+from space_dist.ledger.folder import GIVEN, Ledger, State, Status, find_ledgers, there
 from space_dist.ledger.lock import LEASE_SECONDS, Lock, believed_alive, owner_alive, process_of, this_process
 from space_dist.ledger.rows import (
     CURRICULUM,
@@ -74,7 +74,6 @@ __all__ = [
     "Segment",
     "State",
     "Status",
-    "absent",
     "believed_alive",
     "decode_arrays",
     "decode_checkpoint",
@@ -87,5 +86,6 @@ __all__ = [
     "find_ledgers",
     "owner_alive",
     "process_of",
+    "there",
     "this_process",
 ]

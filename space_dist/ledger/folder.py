@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
-from space_dist.errors import LedgerError, nearest
+from space_dist.errors import LedgerError, NotPlannedError, nearest
 from space_dist.ledger.checkpoint import FORMAT, READABLE, Checkpoint, decode_checkpoint
 from space_dist.ledger.lock import owner_alive
 from space_dist.ledger.rows import METRICS, ROW_FILES, Row, decode_row
@@ -98,7 +98,7 @@ class Ledger:
             content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
             if not self.folder.exists():
-                raise absent(self.folder) from None
+                raise LedgerError(_absent(self.folder)) from None
             below = next((file.parent for file in sorted(self.folder.glob("*/status.json"))), None)
             hint = f"; {below} does" if below else ""
             raise LedgerError(f"{self.folder} holds no run: it has no status.json{hint}") from None
@@ -219,18 +219,26 @@ class Ledger:
         return owner_alive(self.lock_file)
 
 
-def absent(folder: Path) -> LedgerError:
+def _absent(folder: Path) -> str:
     """What to say of a folder that is not there, with the nearest name beside it."""
     hint = nearest(folder.name, (other.name for other in folder.parent.glob("*/")))
-    return LedgerError(f"{folder} does not exist{hint.removesuffix('.')}")
+    return f"{folder} does not exist{hint.removesuffix('.')}"
+
+
+def there(path: Path) -> Path:
+    """The path that a user names as a run's, or as one that holds some. Raises NotPlannedError where nothing is."""
+    if not path.exists():
+        raise NotPlannedError(_absent(path.absolute()))
+    return path
 
 
 def find_ledgers(paths: list[Path]) -> list[Ledger]:
-    """Every run in or below `paths`, sorted by path, each once. Raises LedgerError where there is none."""
+    """Every run in or below `paths`, sorted by path, each once.
+
+    Raises LedgerError where there is none, NotPlannedError where there is no such path.
+    """
     found: dict[Path, Ledger] = {}
-    for path in paths:
-        if not path.exists():
-            raise absent(path)
+    for path in map(there, paths):
         below = [Ledger(path)] if (path / "status.json").exists() else []
         below += [Ledger(file.parent) for file in path.rglob("status.json") if path.is_dir()]
         if not below:

@@ -25,7 +25,7 @@ from space_dist.config.sections import SINKS
 from space_dist.config.tracking_uri import settled_uri
 from space_dist.errors import LedgerError
 from space_dist.experiment.manifest import CELL_ID_DIGITS, MANIFEST, Grid
-from space_dist.ledger import Ledger, Status, absent
+from space_dist.ledger import Ledger, Status, there
 from space_dist.tracking.grids import GridMirror
 from space_dist.tracking.sinks import Sink, sink_of
 from space_dist.tracking.snapshot import NOTE_TAG, read_snapshot
@@ -87,13 +87,11 @@ class Found:
 def find(paths: Iterable[Path]) -> Found:
     """Every run and grid in, below and around `paths`, in order, each once; a grid stands for all its runs.
 
-    Raises LedgerError for a path without any.
+    Raises LedgerError for a path without any, NotPlannedError for one that is not there.
     """
     ledgers: dict[Path, Ledger] = {}
     grids: dict[Path, Grid] = {}
-    for path in paths:
-        if not path.exists():
-            raise absent(path)
+    for path in map(there, paths):
         before = len(ledgers) + len(grids)
         if around := _grid_around(path.resolve()):
             grids[around] = Grid(around)
