@@ -312,12 +312,12 @@ def sync(
     from space_dist.tracking.store import usable_uri
 
     place = "the tracking.uri of each of them" if uri is None else f"MLflow at {usable_uri(uri)}"
-    say(f"mirroring {', '.join(map(str, runs))} to {place}")
     named = [located(path) for path in runs]
     paths = [
         find_grid(path, root).folder if path.is_file() else path for path in (in_root(path, root) for path in named)
     ]
     found = find(paths)
+    say(f"mirroring {', '.join(map(str, runs))} to {place}")
     if follow:
         result = follow_runs(paths, uri, experiment)
     else:
