@@ -285,6 +285,12 @@ def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
         manifest.cell("kapa=4")
     with pytest.raises(ConfigError, match="no seed 7; it has 0, 1"):
         manifest.run("kappa=4", 7)
+    named = [cell for cell in manifest.cells if cell.label.startswith("k")]
+    assert len(named) > 1
+    said = ", ".join(f"{cell.label!r} ({cell.id})" for cell in named)
+    with pytest.raises(ConfigError) as ambiguous:
+        manifest.cell("k")
+    assert f"'k' is ambiguous: {len(named)} cells of {manifest.name} begin so: {said}. Give" in str(ambiguous.value)
     with pytest.raises(LedgerError, match="no grid"):
         find_grid(tmp_path, tmp_path / "runs")
 
@@ -298,6 +304,11 @@ def test_ten_thousand_runs_are_planned_and_shown(tmp_path: Path) -> None:
     found = run_statuses(made.grid, made.manifest, CODE)
     assert (len(made.manifest.cells), len(found), exit_code(found)) == (1000, 10_000, 3)
     assert len({cell.id for cell in made.manifest.cells}) == len({cell.label for cell in made.manifest.cells}) == 1000
+    with pytest.raises(ConfigError, match=r"^'kappa=3 ' is ambiguous: 40 cells of small begin so: 'k.* and 35 more\. "):
+        made.manifest.cell("kappa=3 ")
+    twin = max(cells := [cell.id[:2] for cell in made.manifest.cells], key=cells.count)
+    with pytest.raises(ConfigError, match=f"^'{twin}' is ambiguous"):
+        made.manifest.cell(twin)
 
 
 # ---- where runs stand -----------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ MAX_SEED = 2**31 - 1
 MAX_RUNS = 100_000  # a folder each; a typing error in a range makes millions
 _MAX_MANIFEST_BYTES = 512 << 20
 _MAX_LABEL = 120  # characters; what is cut is told apart by the id
+_MAX_NAMED = 5  # cells that a sentence names
 _CELL_ID = re.compile(rf"[0-9a-f]{{{CELL_ID_DIGITS}}}")
 _NOT_OF_A_GRID = {
     "seed": "seeds",
@@ -445,16 +446,23 @@ class Manifest:
         return 1 + self.resources.workers
 
     def cell(self, text: str) -> Cell:
-        """The cell with this label, or with an id that starts so. Raises ConfigError if there is no such one."""
+        """The cell with this label, or the one whose id starts so. Raises ConfigError if there is none, or several."""
         found = [cell for cell in self.cells if text == cell.label] or [
             cell for cell in self.cells if len(text) >= 2 and cell.id.startswith(text)
         ]
         if len(found) == 1:
             return found[0]
+        begun = [cell for cell in self.cells if text and (cell.label.startswith(text) or cell.id.startswith(text))]
+        if len(begun) > 1:
+            named = ", ".join(f"{cell.label!r} ({cell.id})" for cell in begun[:_MAX_NAMED])
+            more = f" and {len(begun) - _MAX_NAMED} more" if len(begun) > _MAX_NAMED else ""
+            raise ConfigError(
+                f"{text!r} is ambiguous: {len(begun)} cells of {self.name} begin so: {named}{more}. Give a whole "
+                "label, or more of the id"
+            )
         names = [name for cell in self.cells for name in (cell.label, cell.id)]
-        if found:
-            raise ConfigError(f"{text!r} is the start of {len(found)} cells of {self.name}; give more of the id")
-        raise ConfigError(f"{self.name} has no cell {text!r}{nearest(text, names)} `space-dist grid status` lists them")
+        hint = f"; did you mean {begun[0].label!r}?" if begun else nearest(text, names)
+        raise ConfigError(f"{self.name} has no cell {text!r}{hint} `space-dist grid status` lists them")
 
     def run(self, cell: str, seed: int) -> Run:
         """One run. Raises ConfigError if there is no such one."""
