@@ -154,6 +154,11 @@ def test_configs_lists_and_copies(
     assert command(monkeypatch, "config", "check", "mine/sparse_pointmass_edge.yaml") == 0
     assert command(monkeypatch, "configs", "--copy", "sparse_pointmass_edge", "mine") == 2
     assert "exists" in capsys.readouterr().err
+    assert command(monkeypatch, "configs", "--copy", "quickstart") == 2
+    wanted = "NAME and DIR, the folder to copy into: space-dist configs --copy quickstart mine"
+    assert wanted in capsys.readouterr().err
+    assert command(monkeypatch, "configs", "mine") == 2
+    assert "space-dist configs --copy NAME mine" in capsys.readouterr().err
 
 
 # ---- a project to start with -----------------------------------------------------------------------------------------

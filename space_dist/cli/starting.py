@@ -18,16 +18,28 @@ _DISGUISE = ".in"  # of files that would be taken for this package's own
 
 def configs(
     copy: Annotated[
-        Optional[tuple[str, Path]],  # noqa: UP045 - typer reads annotations at run time
-        typer.Option("--copy", metavar="NAME DIR", help="Copy one, and the files it names, into a folder."),
+        Optional[str],  # noqa: UP045 - typer reads annotations at run time
+        typer.Option("--copy", metavar="NAME", help="Copy one, and the files it names, into the folder DIR."),
+    ] = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(metavar="DIR", help="With --copy NAME: the folder to copy into.", show_default=False),
     ] = None,
 ) -> None:
     """List the configs, grids and profiles that ship: a path like shipped:pointmass_space names one anywhere."""
     from space_dist.config import about_shipped, shipped_files
 
     if copy is not None:
-        _copy(*copy)
+        if out is None:
+            raise ConfigError(
+                f"--copy wants two words, NAME and DIR, the folder to copy into: space-dist configs --copy {copy} mine"
+            )
+        _copy(copy, out)
         return
+    if out is not None:
+        raise ConfigError(
+            f"{out}: a folder goes with --copy, which names what to copy into it: space-dist configs --copy NAME {out}"
+        )
     files = [file for file in shipped_files() if file.endswith(".yaml")]
     width = max(map(len, files)) - len(".yaml")
     for file in sorted(files, key=lambda file: ("/" in file, file)):
