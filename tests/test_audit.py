@@ -276,6 +276,8 @@ def test_every_decision_can_be_explained(name: str, run_of: Any) -> None:
             named = ", ".join(str(one) for one in trained[iteration])
             assert f"Line 12: I_curr := {named}" in lines
             assert lines[-1].endswith("the run has trained on these")
+    last = CliRunner().invoke(app, ["explain", str(out)]).stdout.splitlines()
+    assert [last[0], last[1:]] == [f"{lines[0]}, the last; --iteration N shows another", lines[1:]]
 
 
 def test_an_explanation_has_the_numbers_of_the_log(run_of: Any) -> None:

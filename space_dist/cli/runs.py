@@ -137,7 +137,12 @@ def evaluate(
 
 def explain(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
-    iteration: Annotated[int, typer.Option(help="Which, counted from 1: the decision behind it is shown.")],
+    iteration: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            help="Which, counted from 1: the decision behind it is shown. Default: the last.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Show one decision about a set, line by line of Algorithm 1, with its numbers (lines 6 to 13)."""
     from space_dist.instances import read_csv

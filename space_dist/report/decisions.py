@@ -21,9 +21,9 @@ _SHOWN = 12  # instances of a list or a table; the rest are counted
 
 
 def explain(
-    ledger: Ledger, config: RunConfig, bounds: ContextBounds, train: InstanceSet, iteration: int
+    ledger: Ledger, config: RunConfig, bounds: ContextBounds, train: InstanceSet, iteration: int | None = None
 ) -> list[str]:  # fmt: skip
-    """Lines 6 to 13 behind an iteration, counted from 1.
+    """Lines 6 to 13 behind an iteration, counted from 1; None: the last behind which something was decided.
 
     config, train: the run's; bounds: of its contexts. Raises ConfigError where nothing is decided about sets, or there
     is no such iteration; LedgerError where the values of a decision are not there, or lead to another set than the run
@@ -42,6 +42,8 @@ def explain(
             f"({'fork' if config.fork else 'schedule'}), so its decisions cannot be made again from its start"
         )
     decided = [row for row in ledger.rows(METRICS) if row["kind"] == "iteration" and row["complete"]]
+    taken = ", the last; --iteration N shows another" if iteration is None else ""
+    iteration = len(decided) if iteration is None else iteration
     if not 1 <= iteration <= len(decided):
         raise ConfigError(
             f"--iteration {iteration}: {ledger.folder} has decisions behind iterations 1 to {len(decided)}"
@@ -65,7 +67,7 @@ def explain(
             f"{ledger.folder}: iteration {iteration + 1} trained on another set than these values lead to; "
             "jobs/audit.py says where they part"
         )
-    lines = [f"{config.name}, seed {config.seed}, {settings.kind}: iteration {iteration}, {row['steps']:,} steps"]
+    lines = [f"{config.name}, seed {config.seed}, {settings.kind}: iteration {iteration}, {row['steps']:,} steps{taken}"]
     lines.append(f"Trained on: S = {before.size} of {len(train)} instances: {_listed(train.ids[before.selected])}")
     if isinstance(settings, GrowingConfig):
         lines += _growth(settings, feedback, before, state, numbers)
