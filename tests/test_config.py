@@ -335,6 +335,8 @@ def test_settings_that_do_not_go_together() -> None:
 def test_a_file_that_an_override_makes_wrong_is_named_with_it(overrides: list[str], named: str, tmp_path: Path) -> None:
     for line in refusal(SPACE, *overrides).splitlines():
         assert line.startswith(f"{SPACE} with {named}: ")
+    faulty = written(tmp_path, replaced(plain(SPACE), "learner.gamma", 2))
+    assert refusal(faulty, "learner.kind=ppo").startswith(f"{faulty}: learner.gamma: 2: ")  # which is the file's own
     faulty = written(tmp_path, replaced(plain(SPACE), "learner.n_steps", 1000))
     assert refusal(faulty, "learner.gamma=0.9").startswith(f"{faulty}: learner.n_steps = 1000 ")
 

@@ -97,10 +97,10 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         origin for name, origin in origins.items() if f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.")
     )
     where = next(related, source)
-    if where == source and path and f"{path[0]}.kind" in origins:  # by which a section has other keys than the file's
-        where = f"{source} with {origins[f'{path[0]}.kind']}"
     kind, given = fault["type"], fault.get("input")
     context = fault.get("ctx", {})
+    if where == source and kind in ("extra_forbidden", "missing") and (of_kind := origins.get(f"{path[0]}.kind")):
+        where = f"{source} with {of_kind}"  # by which the section has other keys than the file's
     if kind == "extra_forbidden":
         allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
         if root is RunConfig and (meant := what_sb3_calls(path[-1])) is not None:
