@@ -260,8 +260,11 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
             damage = ledger.damage() or _damage_behind(ledger)
             if not damage:
                 return before
-            for sentence in damage:
-                log.warning("%s; computing it again from the last checkpoint that is intact", sentence)
+        else:
+            damage = _damaged_checkpoint(ledger)
+        # Here, where no log is open yet, they are said on standard error.
+        for sentence in damage:
+            log.warning("%s; computing it again from the last checkpoint that is intact", sentence)
         if before.checkpoint is not None and before.format != FORMAT:
             raise ConfigError(
                 f"{ledger.folder} was begun by an earlier version of space_dist (format {before.format} of its files; "
@@ -303,6 +306,19 @@ def _damage_behind(ledger: Ledger) -> list[str]:
         if ledger.has_intact_checkpoint():
             return [str(error)]
         log.warning("%s; the results of %s are whole: its checkpoints may be removed", error, ledger.folder)
+    return []
+
+
+def _damaged_checkpoint(ledger: Ledger) -> list[str]:
+    """What has a run that is not done go back; nothing where it cannot, which `restore` says."""
+    try:
+        ledger.status()
+    except LedgerError:
+        return []  # `_status_before` told of it
+    try:
+        ledger.last_checkpoint()
+    except LedgerError as error:
+        return [str(error)] if ledger.has_intact_checkpoint() else []
     return []
 
 

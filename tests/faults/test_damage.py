@@ -249,6 +249,26 @@ def test_after_a_fallback_the_status_names_the_checkpoint_that_is_used(copy: Pat
     assert {name: (copy / name).stat().st_size for name in ROW_FILES} == dict(status.committed)
 
 
+def test_going_back_is_said_outside_of_the_log_too(
+    original: tuple[Any, Path, Any, Any], copy: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config, _, right, _ = original
+    newest = Ledger(copy).checkpoint_files()[0]
+    newest.write_bytes(newest.read_bytes()[:100])
+    assert resumes_to_the_same_bytes_or_is_refused(config, copy, right)
+    said = f"{newest.name}, is damaged; `train --resume` goes back to the one before it; computing it again from"
+    assert said in caplog.text
+    # Before the log was opened: then it went to standard error.
+    assert said not in (copy / "log.txt").read_text()
+    caplog.clear()
+    for path in Ledger(copy).checkpoint_files():
+        path.write_bytes(b"damaged")
+    if Ledger(copy).status().state != "done":
+        with pytest.raises(LedgerError, match="no checkpoint is intact"):
+            launch(config, copy, resume=True, stop=StopRequests())
+    assert "computing it again" not in caplog.text
+
+
 def test_a_checkpoint_that_cannot_be_read_now_is_not_thrown_away(
     original: tuple[Any, Path, Any, Any], copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
