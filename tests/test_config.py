@@ -304,6 +304,36 @@ def test_unknown_kinds_list_what_is_known() -> None:
     assert "curriculum.kind" in refusal(SPACE, "curriculum={eta: 0.1}")
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("curriculum", "", "curriculum: the section is empty: it needs a kind, like `kind: space`. Allowed: space, "),
+        ("curriculum", "space", "curriculum: 'space' is no section; write {kind: space}"),
+        ("curriculum", "[]", "curriculum: [] is no section: it takes keys and values, and needs a kind, like"),
+        ("learner", "", "learner: the section is empty: it needs a kind, like `kind: ppo`. Allowed: ppo, trpo, a2c"),
+        ("instances", "", "instances: the section is empty: it needs train and test. Allowed here: train, test"),
+        ("budget", "1000", "budget: 1000 is no section: it takes keys and values, and needs steps"),
+        ("evaluation", "", "evaluation: the section is empty: give it keys and values, or leave the key out. Allowed "
+                           "here: every_steps, episodes, legacy_metric"),
+        ("env.kwargs", "", "env.kwargs: is empty; give it keys and values, or leave the key out"),
+        ("schedule", "", "schedule: is empty; give it a list, or leave the key out"),
+        ("schedule", "[null]", "schedule.0: the section is empty: it needs steps and set"),
+    ],
+)  # fmt: skip
+def test_empty_sections_are_told_what_they_need(key: str, value: str, said: str, tmp_path: Path) -> None:
+    path = written(tmp_path, replaced(plain(SPACE), key, Raw(value)))
+    assert f"{path}: {said}" in refusal(path)
+
+
+def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:
+    tree = plain(SPACE)
+    del tree["curriculum"], tree["instances"]
+    text = refusal(written(tmp_path, json.dumps(tree)))
+    assert "curriculum: this key is required: a section with a kind, like `kind: space`; `space-dist config" in text
+    assert "explains it. Allowed: space, round_robin" in text
+    assert "instances: this key is required: a section with train and test; `space-dist config" in text
+
+
 def test_several_faults_are_told_together() -> None:
     text = refusal(SPACE, "seed=-1", "name=a/b", "learner.gamma=2")
     assert [line.partition(": ")[0] for line in text.splitlines()] == [

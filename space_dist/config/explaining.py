@@ -102,15 +102,26 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if where == source and kind in ("extra_forbidden", "missing") and (of_kind := origins.get(f"{path[0]}.kind")):
         where = f"{source} with {of_kind}"  # by which the section has other keys than the file's
     if kind == "extra_forbidden":
-        allowed = [_key(name, field) for name, field in model.model_fields.items()] if model else []
+        allowed = _names(model) if model else []
         if root is RunConfig and (meant := what_sb3_calls(path[-1])) is not None:
             return f"{where}: {key}: unknown key. {meant}"
         if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
             return f"{where}: {key}: unknown key; keys stand in sections: {' or '.join(f'{s}.{key}' for s in sections)}"
         return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
+    field = _field(model, path[-1]) if model and path else None
+    options = _sections(field) if field else []
     if kind == "missing":
         way_out = f"; `space-dist config schema {path[-1]}` explains it" if root is RunConfig else ""
-        return f"{where}: {key}: this key is required{way_out}"
+        needed = f": a section with {needs}" if (needs := _needs(options)) else ""
+        return f"{where}: {key}: this key is required{needed}{way_out}{_allowed_kinds(options)}"
+    if kind in ("model_type", "model_attributes_type"):
+        # An item of a list, or what a user's own name stands for, is no field: then the model is its own.
+        named = [one for one in (*options, model) if one and one.__name__ == context.get("class_name")]
+        return f"{where}: {key or 'the whole file'}: {_no_section(given, named or options)}"
+    if given is None and kind in ("dict_type", "tuple_type"):
+        what = "keys and values" if kind == "dict_type" else "a list"
+        way_out = "" if field and field.is_required() else ", or leave the key out"
+        return f"{where}: {key}: is empty; give it {what}{way_out}"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tags = [tag.strip("' ") for tag in str(context.get("expected_tags") or _tags(path[0])).split(",")]
         given_kind = given.get("kind") if isinstance(given, dict) else given
@@ -140,6 +151,43 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
 
 
+def _no_section(given: object, options: list[type[BaseModel]]) -> str:
+    """What to say of a value that stands where a section should. options: what the section may be."""
+    needs = _needs(options)
+    if given is None:
+        way_out = f"it needs {needs}" if needs else "give it keys and values, or leave the key out"
+        keys = "" if len(options) != 1 else f". Allowed here: {', '.join(_names(options[0]))}"
+        return f"the section is empty: {way_out}{keys or _allowed_kinds(options)}"
+    kinds = _kinds(options)
+    if isinstance(given, str) and given in kinds:
+        return f"{short(given)} is no section; write {{kind: {given}}}"
+    needed = f", and needs {needs}" if needs else ""
+    return f"{short(given)} is no section: it takes keys and values{needed}{_allowed_kinds(options)}"
+
+
+def _needs(options: list[type[BaseModel]]) -> str:
+    """The keys that a section cannot do without, whichever of `options` it is: `train and test`; often empty."""
+    if kinds := _kinds(options):
+        return f"a kind, like `kind: {kinds[0]}`"
+    fields = options[0].model_fields if options else {}
+    required = [_key(name, field) for name, field in fields.items() if field.is_required()]
+    return " and ".join(filter(None, (", ".join(required[:-1]), *required[-1:])))
+
+
+def _names(section: type[BaseModel]) -> list[str]:
+    return [_key(name, field) for name, field in section.model_fields.items()]
+
+
+def _kinds(options: list[type[BaseModel]]) -> list[str]:
+    """What tells several sections apart; empty for a single one."""
+    return [str(get_args(one.model_fields["kind"].annotation)[0]) for one in options] if len(options) > 1 else []
+
+
+def _allowed_kinds(options: list[type[BaseModel]]) -> str:
+    kinds = _kinds(options)
+    return f". Allowed: {', '.join(kinds)}" if kinds else ""
+
+
 def what_sb3_calls(name: str) -> str | None:
     """A sentence that says what a word of Stable-Baselines3's is in a run's config; None for any other."""
     return f"What Stable-Baselines3 calls {name} is {_SB3_NAMES[name]} here" if name in _SB3_NAMES else None
@@ -154,9 +202,7 @@ def _sections_with(key: str) -> list[str]:
 
 
 def _tags(key: str) -> str:
-    return ", ".join(
-        str(get_args(option.model_fields["kind"].annotation)[0]) for option in _models(RunConfig.model_fields[key])
-    )
+    return ", ".join(_kinds(_models(RunConfig.model_fields[key])))
 
 
 def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[list[str], type[BaseModel] | None]:
@@ -210,11 +256,22 @@ def _models(field: Any) -> list[type[BaseModel]]:
     return [one for one in _annotations(field) if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
+def _sections(field: Any) -> list[type[BaseModel]]:
+    """The sections that a field may be; empty where it may be something else, too."""
+    found = _models(field)
+    return found if len(found) == len(_annotations(field).keys() - {types.NoneType}) else []
+
+
 def _annotations(field: Any) -> dict[Any, None]:
     """What a field may be, in order."""
     union = get_origin(field.annotation) in (Union, types.UnionType)
     alternatives = get_args(field.annotation) if union else [field.annotation]
     return {get_args(one)[0] if get_origin(one) is Annotated else one: None for one in alternatives}
+
+
+def _field(model: type[BaseModel], key: str) -> Any:
+    """A section's field by what a config calls it; None if there is none."""
+    return next((field for name, field in model.model_fields.items() if _key(name, field) == key), None)
 
 
 def _key(name: str, field: Any) -> str:
