@@ -292,8 +292,7 @@ def _check_kind_and_size(path: Path) -> None:
     try:
         status = path.stat()
     except FileNotFoundError:
-        beside = nearest(path.name, (file.name for file in path.parent.glob("*.csv")))
-        raise ConfigError(f"there is no such file{beside.removesuffix('.')}") from None
+        raise ConfigError(f"there is no such file{_meant_path(path)}") from None
     except ValueError:  # Python's answer to a NUL in the name
         raise ConfigError("this cannot be the name of a file") from None
     if stat.S_ISDIR(status.st_mode):
@@ -304,6 +303,17 @@ def _check_kind_and_size(path: Path) -> None:
         raise ConfigError("is empty; the first line must name the columns")
     if status.st_size > MAX_FILE_BYTES:
         raise ConfigError(f"has {status.st_size} bytes; an instance file may have at most {MAX_FILE_BYTES}")
+
+
+def _meant_path(path: Path) -> str:
+    """A hint at the file, or at the first folder on the way to it that is misspelt; often empty."""
+    missing = path
+    while not missing.parent.exists() and missing.parent != missing:
+        missing = missing.parent
+    if missing == path:
+        return nearest(path.name, (file.name for file in path.parent.glob("*.csv"))).removesuffix(".")
+    what = f"; there is no folder {_shown_path(missing)}"
+    return what + nearest(missing.name, (other.name for other in missing.parent.glob("*/"))).removesuffix(".")
 
 
 def _lines(file: BinaryIO, first_row: int) -> Iterator[tuple[int, bytes]]:

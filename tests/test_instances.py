@@ -190,6 +190,20 @@ def test_faults_are_named(tmp_path: Path, content: str | bytes, said: list[str])
         assert part in text
 
 
+def test_a_misspelt_folder_is_named_with_the_nearest(tmp_path: Path) -> None:
+    (tmp_path / "instances" / "small").mkdir(parents=True)
+    (tmp_path / "instances.csv").write_text(VALID)
+    text = refusal(tmp_path / "instnaces" / "small" / "train.csv")
+    folder = tmp_path / "instnaces"
+    assert text.endswith(f"there is no such file; there is no folder {folder}; did you mean 'instances'?")
+    text = refusal(tmp_path / "instances" / "smal" / "train.csv")
+    assert text.endswith(f"there is no folder {tmp_path / 'instances' / 'smal'}; did you mean 'small'?")
+    assert refusal(tmp_path / "zzz" / "train.csv").endswith(f"there is no folder {tmp_path / 'zzz'}")
+    (tmp_path / "instances" / "train.csv").write_text(VALID)
+    text = refusal(tmp_path / "instances" / "trian.csv")
+    assert text.endswith("there is no such file; did you mean 'train.csv'?")
+
+
 def test_what_is_not_a_file(tmp_path: Path) -> None:
     assert "no such file" in refusal(tmp_path / "absent.csv")
     assert "is a folder" in refusal(tmp_path)
