@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from space_dist.config.shipped import located
 from space_dist.errors import ConfigError, about, nearest
 
 MAX_FILE_BYTES: Final = 512 * 2**20
@@ -182,7 +183,7 @@ class InstanceSet:
 def read_csv(
     path: Path | str, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False
 ) -> InstanceSet:
-    r"""The instances of a CSV file, checked whole.
+    r"""The instances of a CSV file, checked whole. `shipped:NAME` names one that comes with the package.
 
     The first line names `id`, the features of `bounds` and the further `columns`, in any order, and nothing else; each
     further line is one instance. With `if_there`, `columns` may be missing; a feature among them is a feature.
@@ -194,7 +195,7 @@ def read_csv(
     feature is not a number within its bounds, a further column not a finite number, or if an id or a context occurs
     twice.
     """
-    path, columns = Path(path), [name for name in columns if name not in bounds.names]
+    path, columns = located(path), [name for name in columns if name not in bounds.names]
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:
@@ -211,11 +212,12 @@ def read_csv(
         raise ConfigError(f"{_shown_path(path)}: cannot be read: {error.strerror}") from error
 
 
-def read_features(path: Path, columns: Sequence[str] = ()) -> tuple[InstanceSet, ContextBounds]:
+def read_features(path: Path | str, columns: Sequence[str] = ()) -> tuple[InstanceSet, ContextBounds]:
     """The instances of a CSV file whose environment is not known, and the least bounds that they lie in.
 
     All columns but `id` and `columns` are features. Raises ConfigError as `read_csv` does.
     """
+    path = located(path)
     names = tuple(name for name in _named_columns(path) if name not in ("id", *columns))
     if not names:
         raise ConfigError(f"{_shown_path(path)}: row 1 names no feature")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,8 +20,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecFrameStack
 
+from space_dist.config.shipped import FOLDER
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.instances import InstanceSet
+from space_dist.instances import InstanceSet, read_csv
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
 from tests.faulty_env import Honest
 from tests.test_sb3 import DISCRETE, LINE, SLOTS, TARGETS, line_env, made, ppo, remembered
@@ -142,6 +144,13 @@ def test_numpys_numbers_are_numbers_and_a_copy_is_another() -> None:
         np.testing.assert_array_equal(env.reset(), other.reset())
 
 
+@pytest.mark.parametrize("name", ["shipped:instances/cartpole_train.csv", Path("shipped:cartpole_train.csv")])
+def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
+    env = ContextVecEnv("space_dist/CartPole-v0", name)
+    assert env.instances == read_csv(FOLDER / "instances/cartpole_train.csv", env.bounds)
+    env.close()
+
+
 # ---- what is refused ----
 
 
@@ -164,6 +173,8 @@ def test_numpys_numbers_are_numbers_and_a_copy_is_another() -> None:
         (lambda: ContextVecEnv(Honest, [["a", "b"]]), "instances is a list; give a CSV file"),
         (lambda: ContextVecEnv(Honest, CONTEXTS + 1.0), r"instance 0 has gain = 1\.2, outside .* \[0\.1, 0\.5\]"),
         (lambda: ContextVecEnv(Honest, "nowhere.csv"), "nowhere.csv: there is no such file"),
+        (lambda: ContextVecEnv(Honest, "shipped:instances/cartpole_trian.csv"), "shipped:instances/cartpole_trian.csv: "
+         "nothing of this name comes with space_dist; did you mean 'instances/cartpole_train.csv'"),
         (lambda: ContextVecEnv(LINE, InstanceSet(np.array([0]), np.array([[0.1]]), ("goal",))),
          "features are goal, the environment's are target"),
         (lambda: ContextVecEnv("CartPole-v1", [0.5]), "CartPole-v1.*no `context_space`"),

@@ -116,6 +116,7 @@ def test_a_file_is_read_without_its_environment(tmp_path: Path) -> None:
         assert str(caught.value).startswith(str(path))
     with pytest.raises(ConfigError, match=r"nowhere\.csv: there is no such file"):
         read_features(tmp_path / "nowhere.csv")
+    assert read_features("shipped:instances/cartpole_train.csv")[0].names == ("length",)
 
 
 def test_the_command_says_what_is_wrong(

@@ -111,6 +111,8 @@ def test_what_ships_is_named_with_or_without_its_folder_and_suffix() -> None:
     for bad in ("pointmas_space", "../pyproject", "/etc/passwd", ""):
         with pytest.raises(ConfigError, match=r"nothing of this name comes with space_dist.*`space-dist configs`"):
             configs.located(f"shipped:{bad}")
+    with pytest.raises(ConfigError, match=r"did you mean 'pointmass_target_test\.csv'"):
+        configs.located("shipped:pointmass_target_tset.csv")  # of a CSV file the suffix belongs to the name
     with pytest.raises(ConfigError, match="did you mean 'pointmass_space'"):
         configs.load(Path("shipped:pointmas_space"))
 
@@ -127,6 +129,7 @@ def test_it_is_taken_wherever_a_path_is(
         ("config", "check", "shipped:pointmass_space"), ("grid", "plan", "shipped:quickstart", "--root", "x"),
         ("grid", "plan", "mine.yaml", "--root", "x"), ("grid", "status", "shipped:quickstart", "--root", "x"),
         ("instances", "check", "shipped:pointmass_target_test.csv"),
+        ("env", "check", "space_dist/PointMass-v0", "--instances", "shipped:pointmass_target_test.csv"),
         ("config", "check", "shipped:pointmass_space", "--set", "instances.test=shipped:pointmass_target_test.csv"),
     ):  # fmt: skip
         assert command(monkeypatch, *words) == (3 if "status" in words else 0), (words, capsys.readouterr().err)

@@ -67,7 +67,6 @@ def instances_pad(
     kwarg: Kwargs = None,
 ) -> None:
     """Add instances that no policy can solve, as the environment draws them, until they are a share of the set."""
-    from space_dist.config import located
     from space_dist.envs.padding import pad
     from space_dist.envs.spec import read_spec
     from space_dist.instances import PADDING_IDS, read_csv
@@ -76,7 +75,7 @@ def instances_pad(
         raise ConfigError(f"{out} exists; choose another --out, or remove it")
     kwargs = parse_kwargs(kwarg)
     bounds = read_spec(env, context_visible=False, kwargs=kwargs).context_bounds
-    padded = pad(read_csv(located(file), bounds), share, seed, env, kwargs)
+    padded = pad(read_csv(file, bounds), share, seed, env, kwargs)
     write(out, padded.to_csv())
     say(f"{out}: {len(padded)} instances, {_padding(padded)} (ids from {PADDING_IDS})")
 

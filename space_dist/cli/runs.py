@@ -99,7 +99,7 @@ def evaluate(
     config = stored_config(ledger)
     spec = spec_of(config)
     policies = policies_of(policy_of(ledger, spec))
-    chosen = read_csv(located(instances), spec.context_bounds, config.columns_read, if_there=True)
+    chosen = read_csv(instances, spec.context_bounds, config.columns_read, if_there=True)
     seeds = episode_seeds(config.seed, Purpose.EVALUATION, 2, count=len(chosen))
     optimum = None
     with exits_refused(), spec.opened(spec.slots_for(len(chosen))) as env:

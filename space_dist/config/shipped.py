@@ -37,7 +37,8 @@ def located(path: Path | str) -> Path:
         return FOLDER / found[0]
     if found:
         raise ConfigError(f"{path}: several files are called so: {', '.join(found)}")
-    names = [short for file in files for short in (file, file.removesuffix(".yaml"), Path(file).stem)]
+    names = [short for file in files for short in (file, file.removesuffix(".yaml"),
+                                                 Path(file.removesuffix(".yaml")).name)]  # fmt: skip
     raise ConfigError(
         f"{path}: nothing of this name comes with space_dist{nearest(name, names)} `space-dist configs` lists what does"
     )

@@ -63,8 +63,8 @@ class ContextVecEnv(VecEnv):
 
     env: a class or function that makes a `gymnasium.Env` with a `context_space`, whose `reset` takes
         `options={"context": array}` (docs/your_environment.md), or a batched one; or its id, as `env.id` of a config.
-    instances: a CSV file, an `InstanceSet`, or an (n, d) array of contexts in environment units, one row an instance
-        (ids are 0, 1, ... then; (n,) where a context is one number).
+    instances: a CSV file (or `shipped:NAME`), an `InstanceSet`, or an (n, d) array of contexts in environment units,
+        one row an instance (ids are 0, 1, ... then; (n,) where a context is one number).
     n_envs: how many episodes run at once.
     seed: with the instance and the round it decides each episode's own. SB3's `seed=` of a model takes its place.
     context_visible: whether observations end with the context, scaled from its bounds to [-1, 1].
@@ -349,7 +349,7 @@ def _instances(
 ) -> InstanceSet:
     """What was given as an instance set. Raises ConfigError if it does not belong to these bounds."""
     if isinstance(given, str | Path):
-        return read_csv(Path(given), bounds, columns)
+        return read_csv(given, bounds, columns)
     d = len(bounds.names)
     if isinstance(given, InstanceSet):
         instances = given
