@@ -334,6 +334,25 @@ def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:
     assert "instances: this key is required: a section with train and test; `space-dist config" in text
 
 
+@pytest.mark.parametrize(
+    ("address", "hint"),
+    [
+        ("http://head:8265", " (a job server has http://HOST:PORT, which `grid submit --address` takes)"),
+        ("HTTPS://head", " (a job server has http://HOST:PORT, which `grid submit --address` takes)"),
+        ("loacl", " (did you mean 'local'?)"), ("head", ""), ("head:abc", ""), (":6379", ""), ("head:99999", ""),
+    ],
+)  # fmt: skip
+def test_an_address_that_no_ray_has_is_refused(address: str, hint: str) -> None:
+    override = f"resources.address={address}"
+    said = f"resources.address: must be local, auto, HOST:PORT or ray://HOST:PORT{hint}, not {address!r}"
+    assert refusal(SPACE, override) == f"--set {override}: {said}"
+
+
+@pytest.mark.parametrize("address", ["local", "auto", "head:6379", "10.0.0.1:6379", "'[::1]:6379'", "ray://head:10001"])
+def test_addresses_of_rays_are_taken(address: str) -> None:
+    assert load(SPACE, [f"resources.address={address}"]).resources.address == address.strip("'")
+
+
 def test_several_faults_are_told_together() -> None:
     text = refusal(SPACE, "seed=-1", "name=a/b", "learner.gamma=2")
     assert [line.partition(": ")[0] for line in text.splitlines()] == [

@@ -8,6 +8,7 @@ from typing import Any, Literal, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from space_dist.config.tracking_uri import AUTO, checked_uri
+from space_dist.errors import nearest
 from space_dist.system.importing import why_refused
 
 MAX_LIST = 10_000  # values of a list in a config
@@ -145,6 +146,7 @@ class EvaluationConfig(Section):
         return value
 
 
+_ADDRESSES = ("local", "auto")  # of a Ray, beside HOST:PORT
 _USUAL_ROUNDS = 20  # between checkpoints
 _WORTH = 0.01  # of a run's time
 
@@ -231,7 +233,7 @@ class ResourcesConfig(Patience):
     100,000 steps or more; else 0, as actors would gain nothing. In a cluster: one for each of its CPUs and shard at
     most."""
     address: str = Field(default="local", min_length=1, max_length=300)
-    """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
+    """local: a private Ray on this machine; auto, HOST:PORT or ray://HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)
     """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
 
@@ -240,6 +242,23 @@ class ResourcesConfig(Patience):
     def _so_many(cls, value: int | str) -> int | str:
         if isinstance(value, int) and not 0 <= value <= _MAX_WORKERS:
             raise ValueError(f"must be from 0 to {_MAX_WORKERS}, or auto")
+        return value
+
+    @field_validator("address")
+    @classmethod
+    def _of_a_ray(cls, value: str) -> str:
+        scheme, has_scheme, _ = value.partition("://")
+        host, _, port = value.rpartition(":")
+        if has_scheme:
+            # Others than ray:// are for packages that extend Ray; it is asked when the run begins.
+            known = scheme.lower() not in ("http", "https")
+            hint = "" if known else " (a job server has http://HOST:PORT, which `grid submit --address` takes)"
+        else:
+            known = value in _ADDRESSES or (bool(host) and port.isdecimal() and 0 < int(port) < 65536)
+            near = nearest(value, _ADDRESSES).strip("; ").removesuffix(".")
+            hint = f" ({near})" if near and ":" not in value else ""
+        if not known:
+            raise ValueError(f"must be local, auto, HOST:PORT or ray://HOST:PORT{hint}")
         return value
 
 
