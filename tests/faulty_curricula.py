@@ -413,6 +413,34 @@ class NeedsSuccess(Honest):
         return super().scored(state, feedback)
 
 
+class ReadsSuccess(Honest):
+    """Its scores become NaN, in silence, where success is not known."""
+
+    wants = Wants(episodes=True)
+
+    def step(self, state: Any, feedback: Feedback) -> Any:
+        new, selection, _ = super().step(state, feedback)
+        return new, selection, {}
+
+    def scored(self, state: Any, feedback: Feedback) -> NDArray[np.float64]:
+        assert feedback.episodes is not None
+        scores = super().scored(state, feedback)
+        np.add.at(scores, feedback.episodes.indices, feedback.episodes.success)
+        return scores
+
+
+class Copes(Honest):
+    """Reads success where there is any, and has a way without."""
+
+    wants = Wants(episodes=True)
+
+    def scored(self, state: Any, feedback: Feedback) -> NDArray[np.float64]:
+        assert feedback.episodes is not None
+        scores = super().scored(state, feedback)
+        np.add.at(scores, feedback.episodes.indices, np.nan_to_num(feedback.episodes.success))
+        return scores
+
+
 class Unmakeable(Honest):
     def __init__(self, instances: InstanceSet, seed: int) -> None:
         raise KeyError("no such setting")

@@ -74,13 +74,20 @@ def test_a_curriculums_fault_is_named(kind: str) -> None:
     assert FAULTS[kind] in fault, fault
 
 
-@pytest.mark.parametrize("kind", ["Honest", "Drawing", "Generates", "NeedsSuccess", "NeverChanges", "LooksFirst"])
+@pytest.mark.parametrize(
+    "kind",
+    ["Honest", "Drawing", "Generates", "NeedsSuccess", "ReadsSuccess", "Copes", "NeverChanges", "LooksFirst"],
+)
 def test_without_fault(kind: str) -> None:
     findings = check(f"tests.faulty_curricula:{kind}", instances(), BOUNDS)
     assert findings.faults == []
     notes = {
         "NeedsSuccess": [
             "ValueError: did it succeed?; if it has to know, say Wants(success=True), and other environments"
+        ],
+        "ReadsSuccess": [
+            "it reads the success of episodes without Wants(success=True): where the environment does not say whether "
+            "an episode succeeded, state.scores becomes NaN; if it has to know, say so"
         ],
         "NeverChanges": ["in 30 decisions it selected the same instances", "its order_version changes"],
     }.get(kind, [])

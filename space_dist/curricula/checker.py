@@ -204,7 +204,16 @@ class _Check:
                     iteration.episodes, success=np.full(len(iteration.episodes.success), np.nan)
                 )
                 feedback = self._feedback(used, state, dataclasses.replace(iteration, episodes=episodes), values)
-                (state, selection, _), values = used.step(state, feedback), iteration.values
+                known = dataclasses.replace(feedback, episodes=iteration.episodes)
+                answer, told = used.step(state, feedback), self._step_anew(*copy.deepcopy((state, known)))
+                if (unknown := _nan_of_one(answer[0], told[0])) is not None:
+                    self._findings.notes.append(
+                        "it reads the success of episodes without Wants(success=True): where the environment does not "
+                        f"say whether an episode succeeded, {unknown} becomes NaN; if it has to know, say so, and "
+                        "other environments are refused"
+                    )
+                    return
+                (state, selection, _), values = answer, iteration.values
         except Exception as error:  # somebody else's code may raise anything
             text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {error}"
             self._findings.notes.append(
@@ -294,6 +303,18 @@ def _difference(one: Any, other: Any, name: str = "") -> str | None:
         return None if same else name
     found = (_difference(here, there, part) for part, here, there in pairs)
     return next((one for one in found if one is not None), None)
+
+
+def _nan_of_one(one: State, other: State) -> str | None:
+    """What of a state is NaN, or has one, where the other state has a number; None: nothing."""
+    names = [field.name for field in dataclasses.fields(one)]
+    return next((f"state.{name}" for name in names if _more_nan(getattr(one, name), getattr(other, name))), None)
+
+
+def _more_nan(one: Any, other: Any) -> bool:
+    here, there = np.asarray(one), np.asarray(other)
+    floats = here.dtype.kind == there.dtype.kind == "f" and here.shape == there.shape
+    return floats and bool((np.isnan(here) & ~np.isnan(there)).any())
 
 
 def _named(part: str) -> str:
