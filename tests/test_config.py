@@ -334,6 +334,14 @@ def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:
     assert "instances: this key is required: a section with train and test; `space-dist config" in text
 
 
+def test_what_somebody_elses_code_takes_is_said_to_stand_in_kwargs() -> None:
+    told = refusal(SPACE, "env.length=3")
+    assert told.endswith("context_visible. What the environment takes stands in kwargs: {'length': 3}")
+    told = refusal(SPACE, "curriculum={kind: custom, import: 'mine:Mine', share: 0.5}")
+    assert told.endswith("What a curriculum of your own takes stands in kwargs: {'share': 0.5}")
+    assert refusal(SPACE, "env.kwarg={length: 3}").endswith("Allowed here: id, kwargs, context_visible")
+
+
 @pytest.mark.parametrize(
     ("address", "hint"),
     [

@@ -160,6 +160,10 @@ def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
         (lambda: CurriculumCallback("spacey"), r"CurriculumCallback: curriculum\.kind: 'spacey' is not known; did you "
                                                r"mean 'space'\?"),
         (lambda: CurriculumCallback("space", kapa=2), r"curriculum\.kapa: unknown key; did you mean 'kappa'\?"),
+        (lambda: CurriculumCallback("custom", share=0.5),
+         r"curriculum\.import: this key is required; as an argument it is written \*\*\{'import': \.\.\.\}\n"
+         r"CurriculumCallback: curriculum\.share: unknown key\. Allowed here: kind, import, kwargs, columns\. "
+         r"What a curriculum of your own takes stands in kwargs: \{'share': 0\.5\}$"),
         (lambda: CurriculumCallback("space", eta=-1.0), r"curriculum\.eta: -1\.0: .*greater than 0"),
         (lambda: CurriculumCallback("space", passes=0.0), "passes: 0.0: .*greater than 0"),
         (lambda: CurriculumCallback().selection, r"before learn\(\) has begun"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import keyword
 import re
 import types
 from collections.abc import Iterator, Mapping
@@ -10,8 +11,10 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
+from space_dist.config.curriculum import CustomConfig
 from space_dist.config.quoting import short
 from space_dist.config.run import RunConfig
+from space_dist.config.sections import EnvConfig
 from space_dist.config.tracking_uri import UriError
 from space_dist.errors import nearest, with_changes
 
@@ -35,6 +38,8 @@ _SB3_NAMES = {
     "norm_reward": "learner.normalize_rewards",
     "save_freq": "checkpoint.every_rounds",
 }
+
+_TAKES_KWARGS = {EnvConfig: "the environment", CustomConfig: "a curriculum of your own"}
 
 
 def schema(of: type[BaseModel] = RunConfig) -> Iterator[tuple[str, str, str, str]]:
@@ -107,11 +112,15 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
             return f"{where}: {key}: unknown key. {meant}"
         if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
             return f"{where}: {key}: unknown key; keys stand in sections: {' or '.join(f'{s}.{key}' for s in sections)}"
-        return f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
+        told = f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
+        taker = _TAKES_KWARGS.get(model) if model and isinstance(given, bool | int | float | str) else None
+        return told if taker is None else f"{told}. What {taker} takes stands in kwargs: {short({path[-1]: given})}"
     field = _field(model, path[-1]) if model and path else None
     options = _sections(field) if field else []
     if kind == "missing":
         way_out = f"; `space-dist config schema {path[-1]}` explains it" if root is RunConfig else ""
+        if root is not RunConfig and keyword.iskeyword(path[-1]):  # the key is an argument, and Python's own word
+            way_out = f"; as an argument it is written **{{{path[-1]!r}: ...}}"
         needed = f": a section with {needs}" if (needs := _needs(options)) else ""
         return f"{where}: {key}: this key is required{needed}{way_out}{_allowed_kinds(options)}"
     if kind in ("model_type", "model_attributes_type"):

@@ -25,6 +25,7 @@ class CurriculumCallback(BaseCallback):
         uniform, spdrl, vds, alp_gmm, plr, accel, learnability, procurl, learning_progress, edge or currot
         (docs/curricula.md).
     settings: its settings, by name, as under `curriculum` of a config (`space-dist config schema` explains them).
+        One of your own: `CurriculumCallback("custom", kwargs={"share": 0.5}, **{"import": "my_curriculum:Lagging"})`.
     passes: length of an iteration: as many rounds as cover this many passes over the selected instances.
     start_states: seeded start observations per instance whose mean value is its start value.
     round_steps: environment steps of a round, at least; rounds are whole rollouts of SB3's. None: one rollout of an
