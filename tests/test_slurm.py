@@ -391,6 +391,14 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
     for option, value, key in (("--throttle", -1, "throttle"), ("--cells-per-task", 0, "cells_per_task")):
         code, said = run("slurm", "export", GRID, "--out", tmp_path / "none", option, value)
         assert (code, f"space-dist: {option} {value}: {key}: {value}: Input" in said) == (2, True)
+    code, said = run("slurm", "export", GRID, "--out", tmp_path / "none", "--set", "partition=long", "--set", "nodes=3")
+    assert (code, "--set nodes=3: nodes is for --mode cluster" in " ".join(said.split())) == (2, True)
+    assert not (tmp_path / "none").exists()
+    for mode, nodes, words in (("array", 1, "6 runs in 6 array tasks"), ("cluster", 3, "6 runs in one job of 3 nodes")):
+        code, said = run("slurm", "export", GRID, "--out", tmp_path / mode, "--mode", mode, "--set", f"nodes={nodes}")
+        assert (code, words in said) == (0, True)
+    (tmp_path / "site.yaml").write_text("nodes: 4\n")  # for either mode
+    assert run("slurm", "export", GRID, "--out", tmp_path / "array", "--profile", tmp_path / "site.yaml")[0] == 0
     assert run("slurm", "export", out, "--out", tmp_path / "copy")[0] == 0
     code, said = run("slurm", "export", out, "--out", tmp_path / "copy", "--mode", "arry")
     assert (code, "did you mean 'array'?" in said) == (2, True)

@@ -88,7 +88,7 @@ def slurm_export(
 
     Those of a search train generation after generation, and submit the next ones themselves.
     """
-    from space_dist.config.reading import from_option
+    from space_dist.config.reading import from_option, told
     from space_dist.slurm import Export, export, load_profile
 
     chosen = cast("Mode", one_of(_MODES, mode, "--mode"))
@@ -99,6 +99,13 @@ def slurm_export(
     options = [("--throttle", "throttle", throttle), ("--cells-per-task", "cells_per_task", cells_per_task)]
     settings = [from_option(*option) for option in options if option[-1] is not None]
     site = load_profile(profile, [*(overrides or ()), *settings])
+    for override in overrides or ():
+        # A site's file may have it for the other mode; who types it expects something of it.
+        if chosen == "array" and override.partition("=")[0].strip() == "nodes" and site.nodes > 1:
+            raise ConfigError(
+                f"{told(override)}: nodes is for --mode cluster, one Ray over the nodes of a job; in array mode, the "
+                "default, each task has one node"
+            )
     manifest, instances = _frozen(grid, out)
     made = Export(manifest, site, chosen, None if root is None else root.absolute())
     for path in export(made, instances, out, templates):
