@@ -107,14 +107,7 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if where == source and kind in ("extra_forbidden", "missing") and (of_kind := origins.get(f"{path[0]}.kind")):
         where = f"{source} with {of_kind}"  # by which the section has other keys than the file's
     if kind == "extra_forbidden":
-        allowed = _names(model) if model else []
-        if root is RunConfig and (meant := what_sb3_calls(path[-1])) is not None:
-            return f"{where}: {key}: unknown key. {meant}"
-        if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
-            return f"{where}: {key}: unknown key; keys stand in sections: {' or '.join(f'{s}.{key}' for s in sections)}"
-        told = f"{where}: {key}: unknown key{nearest(path[-1], allowed)} Allowed here: {', '.join(allowed)}"
-        taker = _TAKES_KWARGS.get(model) if model and isinstance(given, bool | int | float | str) else None
-        return told if taker is None else f"{told}. What {taker} takes stands in kwargs: {short({path[-1]: given})}"
+        return f"{where}: {key}: unknown key{_what_is_known(path, model, root, given)}"
     field = _field(model, path[-1]) if model and path else None
     options = _sections(field) if field else []
     if kind == "missing":
@@ -143,11 +136,11 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
             if not key:
                 return f"{with_changes(source, message, origins)}: {message}"
-            named = [
-                told for name, told in origins.items()
+            changed = " ".join(
+                origin for name, origin in origins.items()
                 if name.startswith(f"{key}.") and re.search(rf"\b{re.escape(name[len(key) + 1:])}\b", message)
-            ]  # fmt: skip
-            return f"{' with '.join([source, ' '.join(named)]) if named else where}: {key}: {message}"
+            )  # fmt: skip
+            return f"{f'{source} with {changed}' if changed else where}: {key}: {message}"
         # A value is not repeated here: a URI may hold a password.
         if isinstance(context.get("error"), UriError):
             return f"{where}: {key}: {message}"
@@ -158,6 +151,19 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if kind == "tuple_type":
         return f"{where}: {key}: {short(given)}: Input should be a list"
     return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
+
+
+def _what_is_known(path: list[str], model: type[BaseModel] | None, root: type[BaseModel], given: object) -> str:
+    """What to say of a key that a file may not have, behind "unknown key". model: the section that it stands in."""
+    key = path[-1]
+    if root is RunConfig and (meant := what_sb3_calls(key)) is not None:
+        return f". {meant}"
+    if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
+        return f"; keys stand in sections: {' or '.join(f'{section}.{key}' for section in sections)}"
+    allowed = _names(model) if model else []
+    taker = _TAKES_KWARGS.get(model) if model and isinstance(given, bool | int | float | str) else None
+    way_out = "" if taker is None else f". What {taker} takes stands in kwargs: {short({key: given})}"
+    return f"{nearest(key, allowed)} Allowed here: {', '.join(allowed)}{way_out}"
 
 
 def _no_section(given: object, options: list[type[BaseModel]]) -> str:
