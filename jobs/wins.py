@@ -20,7 +20,7 @@ import space_dist  # noqa: F401 - before NumPy, whose settings it makes
 import numpy as np
 from kept import SAME, Artefact, Cell, asked_to_write, put_between
 
-from space_dist.experiment.manifest import load_grid
+from space_dist.experiment.grid_file import load_grid
 from space_dist.report.outcomes import paired_difference
 from space_dist.report.statistics import (
     Interval,

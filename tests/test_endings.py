@@ -20,7 +20,7 @@ import pytest
 from space_dist import errors
 from space_dist.experiment import endings
 from space_dist.experiment.endings import Busy, Cause, Ended, Evidence, Said, why_ended
-from space_dist.experiment.manifest import Retry
+from space_dist.experiment.grid_file import Retry
 from space_dist.experiment.status import may_retry
 from space_dist.grid import supervisor
 from tests.grids import ROOT

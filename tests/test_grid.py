@@ -17,7 +17,8 @@ from space_dist.cli.grids import grid_retry
 from space_dist.cli.overview import print_failures
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause, Ended
-from space_dist.experiment.manifest import Grid, GridConfig, Manifest, Run, find_grid, label_of
+from space_dist.experiment.grid_file import GridConfig, label_of
+from space_dist.experiment.manifest import Grid, Manifest, Run, find_grid
 from space_dist.experiment.status import (
     Attempts,
     exit_code,

@@ -21,7 +21,8 @@ from rich.console import Console
 from space_dist.cli.runs import print_grid_report
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause, Ended
-from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
+from space_dist.experiment.grid_file import GridTracking, Retry, RunResources
+from space_dist.experiment.manifest import Cell, Grid, Manifest
 from space_dist.experiment.status import Attempts
 from space_dist.grid.planning import plan
 from space_dist.ledger import Ledger, RunWriter

@@ -22,7 +22,8 @@ from typer.testing import CliRunner
 from space_dist.cli import app
 from space_dist.errors import LedgerError
 from space_dist.experiment.endings import Cause, Ended
-from space_dist.experiment.manifest import Cell, Grid, GridTracking, Manifest, Retry, RunResources
+from space_dist.experiment.grid_file import GridTracking, Retry, RunResources
+from space_dist.experiment.manifest import Cell, Grid, Manifest
 from space_dist.experiment.status import Attempts
 from space_dist.ledger import METRICS, TIMING, Ledger, Lock, RunWriter
 from space_dist.tracking import NOTE_TAG, TrackingError, find, follow, sync

@@ -16,7 +16,7 @@ import pytest
 from space_dist.config import read_yaml
 from space_dist.envs.distributions import sample
 from space_dist.errors import ConfigError
-from space_dist.experiment.manifest import load_grid
+from space_dist.experiment.grid_file import load_grid
 from space_dist.grid.planning import plan
 from tests.grids import TINY, write_grid, write_line_instances
 from tests.patience import PATIENCE

@@ -14,7 +14,7 @@ from space_dist import config as configs
 from space_dist.config import TrackingConfig, to_yaml
 from space_dist.config.tracking_uri import settled_experiment, settled_uri
 from space_dist.errors import ConfigError
-from space_dist.experiment.manifest import GridTracking
+from space_dist.experiment.grid_file import GridTracking
 from space_dist.ledger import Ledger, RunWriter
 from space_dist.report import read_config
 from space_dist.tracking import sync, wandb

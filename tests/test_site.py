@@ -33,7 +33,7 @@ from mkdocs.config import load_config
 
 from space_dist import cli, config
 from space_dist.config.shipped import located
-from space_dist.experiment.manifest import GridConfig, load_grid
+from space_dist.experiment.grid_file import GridConfig, load_grid
 from space_dist.experiment.tuning import TuneConfig, is_search
 from space_dist.grid.forking import change_of
 from space_dist.slurm.profile import load_profile

@@ -17,7 +17,8 @@ import pytest
 from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause
-from space_dist.experiment.manifest import Manifest, Run, load_grid
+from space_dist.experiment.grid_file import load_grid
+from space_dist.experiment.manifest import Manifest, Run
 from space_dist.experiment.sampling import given_up
 from space_dist.experiment.status import Attempts
 from space_dist.experiment.tuning import Distribution, Objective, Pruner, TuneConfig, find_tune, load_tune

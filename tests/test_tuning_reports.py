@@ -12,7 +12,8 @@ import pytest
 
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause
-from space_dist.experiment.manifest import Grid, GridConfig, Run, load_grid
+from space_dist.experiment.grid_file import GridConfig, load_grid
+from space_dist.experiment.manifest import Grid, Run
 from space_dist.experiment.sampling import draw, importance
 from space_dist.experiment.search import Search, Trial
 from space_dist.grid.planning import plan

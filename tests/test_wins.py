@@ -17,7 +17,7 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.config import read_yaml
-from space_dist.experiment.manifest import load_grid
+from space_dist.experiment.grid_file import load_grid
 from space_dist.grid.planning import plan
 from tests.commanding import command
 from tests.shell import Shell, bash_blocks, one_server

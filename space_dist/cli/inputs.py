@@ -157,7 +157,7 @@ def config_schema(
 def _schemas() -> dict[str, list[SchemaRow]]:
     """The keys of each kind of file that a user writes."""
     from space_dist.config import RunConfig, schema
-    from space_dist.experiment.manifest import GridConfig
+    from space_dist.experiment.grid_file import GridConfig
     from space_dist.experiment.tuning import TuneConfig
 
     return {name: list(schema(of)) for name, of in (("run", RunConfig), ("grid", GridConfig), ("search", TuneConfig))}

@@ -18,7 +18,8 @@ from typing import Any, Literal
 
 from space_dist.errors import LedgerError
 from space_dist.experiment.endings import Busy, Cause, Ended, Evidence, why_ended
-from space_dist.experiment.manifest import Grid, Manifest, Retry, Run
+from space_dist.experiment.grid_file import Retry
+from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.ledger import Ledger, Row, believed_alive, decode_row, encode_row, process_of, this_process
 from space_dist.system.files import in_words, open_own, read_file
 

@@ -18,17 +18,8 @@ from pydantic import Field, field_validator, model_validator
 from space_dist import config as configs
 from space_dist.config import NAME, Section
 from space_dist.errors import ConfigError, NotPlannedError, nearest
-from space_dist.experiment.manifest import (
-    MANIFEST,
-    MAX_RUNS,
-    Grid,
-    GridTracking,
-    Retry,
-    RunResources,
-    SeedRange,
-    Seeds,
-    in_root,
-)
+from space_dist.experiment.grid_file import MAX_RUNS, GridTracking, Retry, RunResources, SeedRange, Seeds
+from space_dist.experiment.manifest import MANIFEST, Grid, in_root
 
 MAX_TRIALS = 10_000  # of an arm
 _MAX_CHOICES = 1000

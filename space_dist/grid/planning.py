@@ -14,16 +14,8 @@ from space_dist.config import RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import ConfigError, about
 from space_dist.experiment import scaling
-from space_dist.experiment.manifest import (
-    CELL_ID_DIGITS,
-    Cell,
-    Grid,
-    GridConfig,
-    Manifest,
-    RunResources,
-    label_of,
-    load_grid,
-)
+from space_dist.experiment.grid_file import GridConfig, RunResources, label_of, load_grid
+from space_dist.experiment.manifest import CELL_ID_DIGITS, Cell, Grid, Manifest
 from space_dist.grid.conductor import freeze
 from space_dist.instances import InstanceSet
 from space_dist.run.building import Blueprint

@@ -39,7 +39,8 @@ import psutil
 from space_dist.config import RunConfig
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.experiment.endings import AskedBy, Busy, Ended, Evidence, Said, why_ended
-from space_dist.experiment.manifest import Grid, Manifest, Run, RunResources
+from space_dist.experiment.grid_file import RunResources
+from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import Attempts, is_done, last_lines, slurm_job
 from space_dist.grid.fork_server import SAID
 from space_dist.system.files import appending, open_own

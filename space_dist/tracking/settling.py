@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from space_dist.config import TrackingConfig
 from space_dist.config.tracking_uri import settled_experiment, settled_uri
-from space_dist.experiment.manifest import GridTracking
+from space_dist.experiment.grid_file import GridTracking
 from space_dist.system.workplace import absolute_uri
 from space_dist.tracking.sinks import refuse_missing
 
