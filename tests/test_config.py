@@ -411,6 +411,10 @@ def test_overrides_into_something_that_is_no_section() -> None:
     assert "is not a section" in refusal(SPACE, "learner.net_arch.0=1")
 
 
+def test_overrides_fill_a_section_that_is_empty() -> None:
+    assert load(SPACE, ["curriculum=null", "curriculum.kind=round_robin"]).curriculum.kind == "round_robin"
+
+
 @pytest.mark.parametrize(
     "content", [b"", b"\n", b"# only a comment\n", b"3", b"[1, 2]", b"text", b"null", b"---\n...\n", b"\xff\xfe\x00",
                 b"a: b: c", b"\tname: x", b"a\0b", b"{", b"'", b"x: *y", b"- a", b"a: 1\n---\nb: 1\n"],

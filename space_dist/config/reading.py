@@ -117,7 +117,9 @@ def put(data: dict[str, Any], key: str, value: Any, where: str) -> None:
     section: Any = data
     *parents, last = key.split(".")
     for part in parents:
-        section = section.setdefault(part, {})
+        if section.get(part) is None:  # or is empty, as `curriculum:` with nothing below it
+            section[part] = {}
+        section = section[part]
         if not isinstance(section, dict):
             raise ConfigError(f"{where}: {part!r} is not a section")
     section[last] = value
