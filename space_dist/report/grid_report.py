@@ -16,6 +16,7 @@ from space_dist.errors import ConfigError
 from space_dist.experiment import scaling
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.report.curricula import (
+    CellCurricula,
     agreement_rows,
     curricula_of,
     curriculum_rows,
@@ -141,17 +142,53 @@ def build_grid_report(
     if reference is None:
         raise ConfigError(f"{grid.manifest_file} names a baseline {chosen!r} that is none of its cells")
     compared = compare(cells, reference, asked)
-    measures = measured(cells, compared)
-    analysed = cells[:MAX_ANALYSED] if in_depth else []
-    curricula = curricula_of(analysed)
-    note = scaling.in_words(manifest.scale, len(manifest.seeds))
+    found = _found(cells, compared, in_depth=in_depth)
+    summary, remarks = _summary(manifest, cells, reference, compared, asked), _remarks(manifest, cells, compared)
+    sections = _sections(found, summary, scaling.in_words(manifest.scale, len(manifest.seeds)))
+    sections += [Section("Remarks", items=remarks)] if remarks else []
+    document = Document(f"{_TITLE} {manifest.name}", [*sections, Section("How to read this", _METHOD)])
+    markdown = to_markdown(document)
+    tables = _tables(found)
+    files = {
+        **{picture.file: picture.png for section in document.sections for picture in section.pictures},
+        **{name: to_csv(rows).encode() for name, rows in tables.items() if rows},
+        "runs.csv": to_csv(_run_numbers(grid, cells)).encode(),
+        "report.md": markdown.encode(),
+        "report.html": to_html(document).encode(),
+    }
+    with writing_to(folder):
+        for name in {*_pictures_of(folder / "report.md"), *tables} - {*files}:  # of the report before, on other runs
+            (folder / name).unlink(missing_ok=True)
+        for name, content in files.items():
+            atomic_write(folder / name, content)
+    table = [_short_row(*three) for three in zip(cells, compared, found.finals, strict=True)]
+    return GridReport(folder, summary, table, remarks + _untestable(cells, compared), markdown)
 
-    summary = _summary(manifest, cells, reference, compared, asked)
-    remarks = _remarks(manifest, cells, compared)
+
+@dataclass(frozen=True)
+class _Found:
+    """What a report tells, cell by cell. finals: the table's rows. analysed: the cells that are looked at in depth."""
+
+    cells: list[CellRuns]
+    compared: list[Comparison]
+    measures: list[dict[str, Measured]]
+    finals: list[dict[str, str]]
+    analysed: list[CellRuns]
+    curricula: list[CellCurricula]
+
+
+def _found(cells: list[CellRuns], compared: list[Comparison], *, in_depth: bool) -> _Found:
+    measures, analysed = measured(cells, compared), cells[:MAX_ANALYSED] if in_depth else []
     finals = _finals(cells, compared, measures)
+    return _Found(cells, compared, measures, finals, analysed, curricula_of(analysed))
+
+
+def _sections(found: _Found, summary: list[str], note: str) -> list[Section]:
+    """All but remarks and explanations. note: for figures, at which scale of the grid."""
+    cells, compared, analysed = found.cells, found.compared, found.analysed
     sections = [
         Section("", summary),
-        Section("Final return on the held-out instances", rows=finals),
+        Section("Final return on the held-out instances", rows=found.finals),
         *_failed(cells),
         *_curves(cells, compared, note),
     ]
@@ -160,43 +197,30 @@ def build_grid_report(
         few = [f"Of {len(cells):,} cells, instances and curricula of the first {MAX_ANALYSED} are looked at."]
         sections += [
             Section("Steps to the threshold", rows=[_steps_row(*pair) for pair in zip(cells, compared, strict=True)]),
-            *measure_sections(cells, names, measures),
+            *measure_sections(cells, names, found.measures),
             *_maps(cells, note),
             *_pooled(cells),
             Section("Training", rows=[_training_row(cell) for cell in cells]),
             *([Section("Instances and curricula", few)] if 0 < len(analysed) < len(cells) else []),
-            *curriculum_sections(curricula, note),
+            *curriculum_sections(found.curricula, note),
             *instance_sections(analysed, note),
             *released_section(analysed, note),
         ]
-    sections += [Section("Remarks", items=remarks)] if remarks else []
-    document = Document(f"{_TITLE} {manifest.name}", [*sections, Section("How to read this", _METHOD)])
-    markdown = to_markdown(document)
-    more = {
-        "curves.csv": _curve_rows(cells),
-        "seeds.csv": _seed_rows(cells),
-        "inclusion.csv": inclusion_rows(curricula),
-        "curricula.csv": curriculum_rows(curricula),
-        "agreement.csv": agreement_rows(curricula),
-        "forgetting.csv": forgetting_rows(analysed),
+    return sections
+
+
+def _tables(found: _Found) -> dict[str, list[dict[str, Value]]]:
+    """The CSV files about cells, and what is in them, by name; some are empty where nothing is known."""
+    three = zip(found.cells, found.compared, found.measures, strict=True)
+    return {
+        "cells.csv": [_numbers(*each) for each in three],
+        "curves.csv": _curve_rows(found.cells),
+        "seeds.csv": _seed_rows(found.cells),
+        "inclusion.csv": inclusion_rows(found.curricula),
+        "curricula.csv": curriculum_rows(found.curricula),
+        "agreement.csv": agreement_rows(found.curricula),
+        "forgetting.csv": forgetting_rows(found.analysed),
     }
-    files = {
-        **{picture.file: picture.png for section in document.sections for picture in section.pictures},
-        "cells.csv": to_csv([_numbers(*three) for three in zip(cells, compared, measures, strict=True)]).encode(),
-        **{name: to_csv(rows).encode() for name, rows in more.items() if rows},
-        "runs.csv": to_csv(_run_numbers(grid, cells)).encode(),
-        "report.md": markdown.encode(),
-        "report.html": to_html(document).encode(),
-    }
-    with writing_to(folder):
-        for name in {*_pictures_of(folder / "report.md"), *more} - {*files}:  # of the report before, on other runs
-            (folder / name).unlink(missing_ok=True)
-        for name, content in files.items():
-            atomic_write(folder / name, content)
-    table = [
-        _short_row(cell, comparison, final) for cell, comparison, final in zip(cells, compared, finals, strict=True)
-    ]
-    return GridReport(folder, summary, table, remarks + _untestable(cells, compared), markdown)
 
 
 def _pictures_of(report: Path) -> list[str]:
