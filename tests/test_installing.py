@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.server
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ import site
 import subprocess
 import sys
 import tarfile
+import threading
 import zipfile
 from pathlib import Path
 
@@ -24,6 +26,7 @@ from space_dist.errors import ConfigError, LedgerError
 from space_dist.slurm import load_profile
 from tests.commanding import command
 from tests.patience import PATIENCE
+from tests.test_report import start_run
 
 ROOT = Path(__file__).parents[1]
 SHORT = ("--set", "budget.steps=2048", "--set", "learner.n_steps=1024", "--set", "learner.n_epochs=1", "--set",
@@ -106,13 +109,14 @@ def test_what_ships_is_named_with_or_without_its_folder_and_suffix() -> None:
     whole = ROOT / "configs/grids/quickstart.yaml"
     for name in ("grids/quickstart.yaml", "grids/quickstart", "quickstart", "quickstart.yaml"):
         assert configs.located(f"shipped:{name}").samefile(whole)
-    assert configs.located("shipped:instances/cartpole_test.csv").name == "cartpole_test.csv"
+    for name in ("instances/cartpole_test.csv", "cartpole_test.csv", "instances/cartpole_test", "cartpole_test"):
+        assert configs.located(f"shipped:{name}").samefile(ROOT / "configs/instances/cartpole_test.csv")
     assert configs.located(Path("configs/x.yaml")) == Path("configs/x.yaml")
     for bad in ("pointmas_space", "../pyproject", "/etc/passwd", ""):
         with pytest.raises(ConfigError, match=r"nothing of this name comes with space_dist.*`space-dist configs`"):
             configs.located(f"shipped:{bad}")
     with pytest.raises(ConfigError, match=r"did you mean 'pointmass_target_test\.csv'"):
-        configs.located("shipped:pointmass_target_tset.csv")  # of a CSV file the suffix belongs to the name
+        configs.located("shipped:pointmass_target_tset.csv")
     with pytest.raises(ConfigError, match="did you mean 'pointmass_space'"):
         configs.load(Path("shipped:pointmas_space"))
 
@@ -144,8 +148,10 @@ def test_configs_lists_and_copies(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert command(monkeypatch, "configs") == 0
-    lines = capsys.readouterr().out.splitlines()
+    *lines, sets = capsys.readouterr().out.splitlines()
     assert len(lines) == len([file for file in configs.shipped_files() if file.endswith(".yaml")])
+    assert "shipped:instances/NAME.csv: " in sets
+    assert "pointmass_target_test, " in sets
     assert all(re.fullmatch(r"shipped:[\w/]+ +\S.{10,}", line) for line in lines), lines
     assert command(monkeypatch, "configs", "--copy", "quickstart", "mine") == 0
     copied = sorted(path.relative_to("mine").as_posix() for path in Path("mine").rglob("*.*"))
@@ -215,6 +221,21 @@ def test_a_folder_that_holds_something_is_left_alone(
 # ---- extras ----------------------------------------------------------------------------------------------------------
 
 
+def without(library: str, folder: Path) -> Path:
+    """A script that is the command, where `library` cannot be imported."""
+    script = folder / "hidden.py"
+    script.write_text(
+        "import sys\n"
+        "class Hider:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] == {library!r}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Hider())\n"
+        "from space_dist.cli import main\nmain()\n"
+    )
+    return script
+
+
 @pytest.mark.parametrize(("words", "sentence"), [
     (("train", "shipped:pointmass_space", "--workers", "2", "--out", "run"),
      "resources.workers: 2 needs Ray: pip install 'space-dist[ray]', or use resources.workers=0"),
@@ -225,27 +246,17 @@ def test_a_folder_that_holds_something_is_left_alone(
 ])  # fmt: skip
 def test_a_missing_ray_is_named_with_its_extra(words: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
     """PyBullet's: tests/test_bullet.py."""
-    hidden = tmp_path / "hidden.py"
-    hidden.write_text(
-        "import sys\n"
-        "class Hider:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.partition('.')[0] == 'ray':\n"
-        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
-        "sys.meta_path.insert(0, Hider())\n"
-        "from space_dist.cli import main\nmain()\n"
-    )
+    hidden = without("ray", tmp_path)
     quiet = ("--set", "tracking.uri=null") if words[0] == "train" else ()
     told = said([sys.executable, hidden, *words, *quiet], tmp_path, 2)
     assert sentence in " ".join(told.split())
 
 
-def test_a_missing_mlflow_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from space_dist.tracking import store
-
-    monkeypatch.setitem(sys.modules, "mlflow", None)
-    with pytest.raises(ConfigError, match=r"needs MLflow: pip install 'space-dist\[mlflow\]'"):
-        store._new_client(f"sqlite:///{tmp_path / 'mlflow.db'}")
+def test_a_missing_mlflow_is_named_with_its_extra(tmp_path: Path) -> None:
+    start_run(tmp_path / "run")
+    told = said([sys.executable, without("mlflow", tmp_path), "sync", "run", "--uri", "sqlite:///m.db"], tmp_path, 2)
+    assert "needs MLflow: pip install 'space-dist[mlflow]', or use tracking.uri=null" in told
+    assert not (tmp_path / "m.db").exists()
 
 
 # ---- version, completion, doctor -------------------------------------------------------------------------------------
@@ -290,11 +301,26 @@ def test_what_hangs_and_what_crashes_is_told(monkeypatch: pytest.MonkeyPatch) ->
     for check in (health.mlflow_works(ask=True), health.ray_works(start=True), health.bullet_works()):
         (found,) = check
         assert (found.state, "pip install 'space-dist[" in found.mend) == ("note", True)
-    monkeypatch.setattr(health, "_version", lambda distribution: "3")
-    monkeypatch.setattr(health, "_failure", lambda code, kind="import": None)
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
-    states = {found.state: found.what for found in health.mlflow_works(ask=True)}
-    assert "127.0.0.1 does not answer" in states["broken"]
+
+
+@pytest.mark.parametrize(("uri", "state", "told"), [
+    ("nonsense://x", "broken", "a tracking URI of the kind nonsense: cannot be mirrored to"),
+    ("http://127.0.0.1:9", "broken", "no MLflow answers at 127.0.0.1:9: "),
+    ("http://127.0.0.1:{port}/", "broken", "no MLflow answers at 127.0.0.1:"),
+    ("sqlite:///{there}/mlflow.db", "ok", "a database in {there}"),
+    ("sqlite:///{there}/absent/mlflow.db", "note", "the folder {there}/absent of its database is not there"),
+])  # fmt: skip
+def test_where_the_environment_mirrors_to_is_looked_at(
+    uri: str, state: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as no_mlflow:
+        threading.Thread(target=no_mlflow.serve_forever, daemon=True).start()
+        words = {"port": no_mlflow.server_port, "there": tmp_path}
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri.format(**words))
+        found = list(health.mlflow_works(ask=True))[-1]
+        no_mlflow.shutdown()
+    assert found.state == state
+    assert f"MLFLOW_TRACKING_URI: {told.format(**words)}" in found.what
 
 
 def test_the_command_lists_what_it_has() -> None:

@@ -11,6 +11,7 @@ import logging
 import shutil
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,10 +24,11 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
+from space_dist.config import TrackingConfig
 from space_dist.errors import ConfigError
 from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
 from space_dist.report import figures
-from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, answers, follow, store, sync
+from space_dist.tracking import ROWS_TAG, RUN_TAG, TrackingError, answers, follow, pusher, store, sync
 from space_dist.tracking.pusher import ended_within
 from tests.patience import PATIENCE
 from tests.test_report import GROWTH, STARTED, STEPS, continue_run, finished_run, start_run
@@ -66,6 +68,16 @@ def stop_in(last: int, events: Mapping[int, Callable[[], object]]) -> Callable[[
         return now >= last
 
     return stop
+
+
+def test_what_somebody_must_mend_is_passed_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As that MLflow is not installed: the next `space-dist sync` would say no more."""
+    script = tmp_path / "pusher.py"
+    script.write_text("import sys\nprint('space-dist: first a cable is needed', file=sys.stderr)\nsys.exit(2)\n")
+    monkeypatch.setattr(pusher, "PYTHON", (sys.executable, str(script)))
+    mirrored = pusher.Pusher(TrackingConfig(uri="http://127.0.0.1:9"), tmp_path, tmp_path / "log.txt")
+    said = mirrored.warning(PATIENCE, "run") or ""
+    assert "http://127.0.0.1:9 could not be brought up to date: first a cable is needed; nothing is lost: `spa" in said
 
 
 def test_a_finished_run_is_mirrored_whole_and_once(uri: str, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import functools
 import importlib.metadata
 import os
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from urllib.parse import urlsplit
 import typer
 
 from space_dist.cli.terminal import delivered, say
+from space_dist.config.tracking_uri import URI_VARIABLE, UriError, checked_uri
 from space_dist.system.importing import PYTHON
 
 _NEEDED: Final = (
@@ -26,7 +26,7 @@ _NEEDED: Final = (
 )  # fmt: skip
 _LEAST_MB, _LEAST_FREE_MB = 2000, 1000  # of memory for a run with a Ray of its own; of disk for its files
 _NO_ANSWER = "no answer within"
-_SECONDS: Final = {"import": 60.0, "ray": 120.0, "command": 10.0, "server": 5.0}  # before a check is given up
+_SECONDS: Final = {"import": 60.0, "ray": 120.0, "command": 10.0, "server": 30.0}  # before a check is given up
 _START_RAY: Final = """
 from space_dist.system.workplace import private_ray
 private_ray()
@@ -35,6 +35,12 @@ from space_dist.run.ray_session import join_ray, remove_session
 found = join_ray("local", 1)
 ray.shutdown()
 remove_session(found["session_dir"])
+"""
+_ASK_MLFLOW: Final = """
+import os
+os.environ.update(MLFLOW_HTTP_REQUEST_TIMEOUT="5", MLFLOW_HTTP_REQUEST_MAX_RETRIES="0")
+from space_dist.tracking.store import ask
+ask(os.environ["MLFLOW_TRACKING_URI"].rstrip("/"))
 """
 
 State = Literal["ok", "note", "broken"]
@@ -179,18 +185,30 @@ def mlflow_works(*, ask: bool) -> Iterator[Finding]:
         yield _not_imported(f"MLflow {version}", why, "mlflow")
         return
     yield Finding("ok", f"MLflow {version}")
-    uri = os.environ.get("MLFLOW_TRACKING_URI", "")
-    parts = urlsplit(uri)
-    if not ask or parts.scheme not in ("http", "https") or not parts.hostname:
-        return
+    if uri := os.environ.get(URI_VARIABLE, ""):
+        yield from _store_of_environment(uri, ask=ask)
+
+
+def _store_of_environment(uri: str, *, ask: bool) -> Iterator[Finding]:
+    """What MLFLOW_TRACKING_URI names: where runs are mirrored to, unless a config says otherwise."""
     try:
-        port = parts.port or (443 if parts.scheme == "https" else 80)
-        with socket.create_connection((parts.hostname, port), timeout=_SECONDS["server"]):
-            yield Finding("ok", f"MLFLOW_TRACKING_URI: {parts.hostname}:{port} answers")
-    except (OSError, ValueError) as error:
-        yield Finding(
-            "broken", f"MLFLOW_TRACKING_URI: {parts.hostname} does not answer: {error}",
-            "start the server, or unset MLFLOW_TRACKING_URI; nothing of a run is lost meanwhile (space-dist sync)",
+        parts = urlsplit(checked_uri(uri))
+    except UriError as error:
+        yield Finding("broken", f"{URI_VARIABLE}: {error}", f"name one of those, or unset {URI_VARIABLE}")
+        return
+    if parts.scheme == "sqlite":
+        folder = Path(uri.removeprefix("sqlite:///")).absolute().parent
+        there = folder.is_dir() and os.access(folder, os.W_OK)
+        yield _noted_unless(
+            there, f"{URI_VARIABLE}: a database in {folder}",
+            f"{URI_VARIABLE}: the folder {folder} of its database is not there, or cannot be written to",
+            "the first run that is mirrored makes it, if it may; or name another one",
+        )  # fmt: skip
+    elif ask:
+        why = _failure(_ASK_MLFLOW, "server")
+        yield Finding("ok", f"{URI_VARIABLE}: an MLflow answers at {parts.netloc}") if why is None else Finding(
+            "broken", f"{URI_VARIABLE}: no MLflow answers at {parts.netloc}: {why}",
+            f"start the server, or unset {URI_VARIABLE}; nothing of a run is lost meanwhile (space-dist sync)",
         )  # fmt: skip
 
 
@@ -247,7 +265,7 @@ def _not_imported(what: str, why: str, distribution: str) -> Finding:
     return Finding("broken", f"{what} cannot be imported: {why}", f"pip install --force-reinstall {distribution}")
 
 
-def _failure(code: str, kind: Literal["import", "ray"] = "import") -> str | None:
+def _failure(code: str, kind: Literal["import", "ray", "server"] = "import") -> str | None:
     """Why Python fails at this, in a process of its own, which can crash and hang as it likes; None if it does not."""
     try:
         done = subprocess.run(

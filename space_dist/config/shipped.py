@@ -25,20 +25,21 @@ def shipped_files() -> tuple[str, ...]:
 def located(path: Path | str) -> Path:
     """`shipped:NAME` as the path of that file; any other path as it is.
 
-    NAME is a path below `FOLDER`, with its suffix or, of a YAML file, without; its folder can be left out where no
-    other file is called so. Raises ConfigError for a name that no file has.
+    NAME is a path below `FOLDER`, with its suffix or without, which YAML files go before; its folder can be left out
+    where no other file is called so. Raises ConfigError for a name that no file has.
     """
     if not str(path).startswith(PREFIX):
         return Path(path)
     name, files = str(path).removeprefix(PREFIX), shipped_files()
-    wanted = name if name.endswith(_SUFFIXES) else f"{name}.yaml"
-    found = [file for file in files if file == wanted] or [file for file in files if Path(file).name == wanted]
+    found: list[str] = []
+    for wanted in [name] if name.endswith(_SUFFIXES) else [f"{name}{suffix}" for suffix in _SUFFIXES]:
+        alike = [file for file in files if wanted in (file, Path(file).name)]
+        found = found or [file for file in alike if file == wanted] or alike
     if len(found) == 1:
         return FOLDER / found[0]
     if found:
         raise ConfigError(f"{path}: several files are called so: {', '.join(found)}")
-    names = [short for file in files for short in (file, file.removesuffix(".yaml"),
-                                                 Path(file.removesuffix(".yaml")).name)]  # fmt: skip
+    names = [short for file in files for short in (file, file.rpartition(".")[0], Path(file).stem, Path(file).name)]
     raise ConfigError(
         f"{path}: nothing of this name comes with space_dist{nearest(name, names)} `space-dist configs` lists what does"
     )

@@ -25,6 +25,7 @@ PYTHON = (sys.executable, "-P")
 """How a Python of ours is started: -P keeps what happens to lie in the current folder from being imported first."""
 
 _OURS = "space_dist"
+_CARL = "carl"
 _COMES_WITH_PYTHON = ("pip", "setuptools", "wheel")
 _ENVIRONMENTS = "pybullet-envs-gymnasium"  # a library that we test with, of environments alone
 _REQUIREMENT = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^\]]*)\])?")
@@ -75,6 +76,8 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
         if missing == module.partition(".")[0]:
             hint = nearest(missing, _modules_here())
             what += f"{hint} It was looked for where Python looks (PYTHONPATH), and last in {Path.cwd()}"
+            if missing == _CARL:
+                what += '; CARL is the package carl-bench: docs/environments.md ("CARL") says how it is installed'
         raise ConfigError(f"{where}: cannot import {module!r}: {what}") from error
     if of_library is not None and isinstance(found, type) and issubclass(found, of_library):
         return found

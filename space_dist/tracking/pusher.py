@@ -15,6 +15,8 @@ from space_dist.system.importing import PYTHON
 
 _KILL_SECONDS: Final = 5.0
 _MOST_SAID: Final = 1 << 20  # bytes of what it says that are looked through
+_REFUSED: Final = 2  # its exit code where somebody has to mend something first, which it says last
+_BEGINNING: Final = "space-dist: "  # of sentences on standard error
 LOOK_AT: Final = "Look at "  # begins the lines in which `sync` names MLflow's pages
 
 
@@ -41,19 +43,24 @@ class Pusher:
         if ended_within(self._process, seconds):
             return None
         # Negative: it was still at it, has said nothing maybe, and was ended.
-        late = f" in {seconds:.0f} s" if self._process.returncode < 0 else ""
+        why = f" in {seconds:.0f} s" if self._process.returncode < 0 else ""
+        if self._process.returncode == _REFUSED and (said := self._said()):
+            why = f": {said[-1].removeprefix(_BEGINNING)}"
         return (
-            f"{self._where} could not be brought up to date{late}; nothing is lost: `space-dist sync {self._folder}` "
+            f"{self._where} could not be brought up to date{why}; nothing is lost: `space-dist sync {self._folder}` "
             f"replays the {what} (details: {self._log_file})"
         )
 
     def pages(self) -> list[str]:
         """Where to look at what was pushed, in words; none before it has ended well, and none without MLflow."""
+        # Each once: the pusher of a conductor that was killed writes its own into the same file.
+        return list(dict.fromkeys(line.removeprefix(LOOK_AT) for line in self._said() if line.startswith(LOOK_AT)))
+
+    def _said(self) -> list[str]:
+        """The lines that it has said."""
         with contextlib.suppress(OSError), self._log_file.open("rb") as log:
             log.seek(self._said_before)
-            lines = log.read(_MOST_SAID).decode(errors="replace").splitlines()
-            # Each once: the pusher of a conductor that was killed writes its own into the same file.
-            return list(dict.fromkeys(line.removeprefix(LOOK_AT) for line in lines if line.startswith(LOOK_AT)))
+            return log.read(_MOST_SAID).decode(errors="replace").splitlines()
         return []
 
 

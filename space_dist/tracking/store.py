@@ -384,13 +384,18 @@ def usable_uri(uri: str) -> str:
         raise ConfigError(str(error)) from None
 
 
+def ask(uri: str) -> None:
+    """Raises TrackingError unless MLflow itself answers at a server's URI."""
+    with store_errors(uri):
+        _new_client(uri).search_experiments(max_results=1)
+
+
 def _database(uri: str) -> Path:
     return Path(uri.removeprefix("sqlite:///"))
 
 
 def _new_client(uri: str) -> MlflowClient:
-    with needed_from("mlflow", "the mirror in MLflow", "use tracking.uri=null"):
-        from mlflow import MlflowClient
+    from mlflow import MlflowClient
 
     for name in ("mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -426,13 +431,17 @@ def _locked(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def store_errors(uri: str) -> Iterator[None]:
-    """Run MLflow, and say what went wrong in our words. Raises TrackingError and RefusedError."""
+    """Run MLflow, and say what went wrong in our words.
+
+    Raises TrackingError and RefusedError; ConfigError where MLflow is not installed.
+    """
     from space_dist.tracking import answers  # here: it imports requests
 
     for name, value in {**_ENVIRONMENT, **answers.ENVIRONMENT}.items():
         os.environ.setdefault(name, value)  # MLflow reads some of them when it is imported: next
+    with needed_from("mlflow", "the mirror in MLflow", "use tracking.uri=null"):
+        from mlflow.exceptions import MlflowException
     import requests
-    from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
     answers.bound_answers()
