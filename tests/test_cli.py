@@ -87,6 +87,7 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (train("resources.workers=4096"), ["resources.workers: 4096 rollout actors", "CPUs, at most", "4 shards"]),
         (train("kappa=4"), ["--set kappa=4", "unknown key; keys stand in sections: curriculum.kappa"]),
         (train("n_epochs=4"), ["keys stand in sections: learner.n_epochs"]),
+        (train("kapa=4"), ["kapa: unknown key; did you mean 'curriculum.kappa'? Allowed here: name"]),
         (train("name=../../etc/passwd"), ["name", "etc/passwd"]),
         (train("env.id=space_dist/PointMas-v0"), ["env.id", "did you mean 'space_dist/PointMass-v0'?"]),
         (train("env.id=no_such_module:make"), ["env.id", "no_such_module", "and last in"]),

@@ -39,6 +39,9 @@ class ReportView:
     def __str__(self) -> str:
         return self.markdown
 
+    def __repr__(self) -> str:
+        return f"ReportView({str(self.folder)!r}: {len(self.table)} rows, {len(self.figures)} figures; print(report))"
+
     def _repr_html_(self) -> str:
         """The table, what belongs below it, and the figures, as notebooks show them."""
         columns = [*self.table[0]] if self.table else []

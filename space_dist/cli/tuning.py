@@ -223,8 +223,8 @@ def _search_of(place: Grid, manifest: Manifest) -> Search:
 def _summary(manifest: Manifest, search: Search) -> str:
     counts = Counter(trial.state for trial in search.trials)
     parts = [f"{count} {state}" for state, count in sorted(counts.items())]
-    heirs = len(search.trials) - search.asked
-    asked = f"{search.asked} of {search.total} trials asked" + (f", and {heirs} heirs" if heirs else "")
+    copies = len(search.trials) - search.asked
+    asked = f"{search.asked} of {search.total} trials asked" + (f", and {copies} copied members" if copies else "")
     return f"{manifest.name}: {asked}: {', '.join(parts)}"
 
 

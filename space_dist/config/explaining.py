@@ -161,9 +161,14 @@ def _what_is_known(path: list[str], model: type[BaseModel] | None, root: type[Ba
     if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
         return f"; keys stand in sections: {' or '.join(f'{section}.{key}' for section in sections)}"
     allowed = _names(model) if model else []
+    hint = nearest(key, allowed)
+    if hint == "." and root is RunConfig and len(path) == 1:  # misspelt, and without its section
+        below = {name: f"{section}.{name}" for section in allowed for name in _names_below(section)}
+        close = nearest(key, below)
+        hint = next((f"; did you mean {whole!r}?" for name, whole in below.items() if f" {name!r}?" in close), hint)
     taker = _TAKES_KWARGS.get(model) if model and isinstance(given, bool | int | float | str) else None
     way_out = "" if taker is None else f". What {taker} takes stands in kwargs: {short({key: given})}"
-    return f"{nearest(key, allowed)} Allowed here: {', '.join(allowed)}{way_out}"
+    return f"{hint} Allowed here: {', '.join(allowed)}{way_out}"
 
 
 def _no_section(given: object, options: list[type[BaseModel]]) -> str:
@@ -214,6 +219,10 @@ def _sections_with(key: str) -> list[str]:
         name for name, field in RunConfig.model_fields.items()
         if any(key in model.model_fields for model in _models(field))
     ]  # fmt: skip
+
+
+def _names_below(section: str) -> list[str]:
+    return [name for model in _models(RunConfig.model_fields[section]) for name in _names(model)]
 
 
 def _tags(key: str) -> str:

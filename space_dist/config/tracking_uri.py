@@ -7,6 +7,7 @@ when a run begins or a grid is frozen, and written down with it: whoever mirrors
 from __future__ import annotations
 
 import os
+import re
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -81,6 +82,8 @@ def checked_uri(uri: str) -> str:
         if parts.query or parts.fragment:
             raise UriError(f"the tracking URI for {host} has more than a path after its host; {ALLOWED}")
         return uri.rstrip("/")
+    if re.fullmatch(r"[\w.-]+:\d+(/.*)?", uri):
+        raise UriError(f"the tracking URI {uri!r} lacks its beginning: http://{uri}, of an MLflow server")
     if parts.scheme == "sqlite":
         name = uri.removeprefix(_SQLITE)
         if name in (uri, "", ":memory:") or name.endswith("/") or "?" in name or "\0" in name:

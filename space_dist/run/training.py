@@ -376,7 +376,9 @@ class Training:
                 row[split]["legacy_return"] = float(returns.mean())
             self._append(row)
             self._know_returns([row])
-            log.info("%d steps: return train %s, test %s", row["steps"], row["train"]["return"], row["test"]["return"])
+            log.info(
+                "%d steps: return train %.6g, test %.6g", *(row["steps"], row["train"]["return"], row["test"]["return"])
+            )
 
         self._asked.pending.append(_Pending(handles, settle))
         run.evaluated_at = run.steps

@@ -46,8 +46,9 @@ class Pusher:
         why = f" in {seconds:.0f} s" if self._process.returncode < 0 else ""
         if self._process.returncode == _REFUSED and (said := self._said()):
             why = f": {said[-1].removeprefix(_BEGINNING)}"
+        could = f"not all of {self._where} could" if " and " in self._where else f"{self._where} could not"
         return (
-            f"{self._where} could not be brought up to date{why}; nothing is lost: `space-dist sync {self._folder}` "
+            f"{could} be brought up to date{why}; nothing is lost: `space-dist sync {self._folder}` "
             f"replays the {what} (details: {self._log_file})"
         )
 
