@@ -83,13 +83,19 @@ def about(where: str, changes: Mapping[str, str] = MappingProxyType({})) -> Iter
 
 
 def with_changes(where: str, sentence: str, changes: Mapping[str, str]) -> str:
-    """`FILE with --set learner.n_steps=1000`: a file, and those changes made to it whose keys the sentence names.
+    """`FILE with --set learner.n_steps=1000`: a file, and those changes made to it that the sentence speaks of.
 
-    changes: by key (of a section, or of something in one), how each was told.
+    changes: by key (of a section, or of something in one), how each was told. It is found by its key, or its value.
     """
     sections, keys = _SECTION.findall(sentence), _SECTION_AND_KEY.findall(sentence)
     named = [
         told for change, told in changes.items()
         if change in sections or any(f"{key}.".startswith(f"{change}.") or change.startswith(f"{key}.") for key in keys)
+        or ((word := _value(told)) and (f"'{word}'" in sentence or ("." in word and f"/{word}" in sentence)))
     ]  # fmt: skip
     return " with ".join([where, " ".join(named)]) if named else where
+
+
+def _value(told: str) -> str:
+    """The value of `--set a.b=c`; of a path, its last part."""
+    return told.partition("=")[2].rpartition("/")[2]

@@ -255,14 +255,12 @@ def refuse_overlap(train: InstanceSet, test: InstanceSet, train_name: str, test_
     crossing = (first < len(train)) & (second >= len(train))
     if crossing.any():
         train_ids, test_ids = train.ids[first[crossing]], test.ids[second[crossing] - len(train)]
-        pairs = [
-            f"id {a} of {train_name} is id {b} of {test_name}"
-            for a, b in zip(train_ids[:3].tolist(), test_ids[:3].tolist(), strict=True)
-        ]
+        pairs = [f"{a} is {b}" for a, b in zip(train_ids[:3].tolist(), test_ids[:3].tolist(), strict=True)]
         more = f" and {len(train_ids) - 3} more" if len(train_ids) > 3 else ""
+        files = f"of {train_name} and {test_name}, by their ids: {', '.join(pairs)}{more}"
+        what = f"both are {train_name}" if train_name == test_name else files
         raise ConfigError(
-            f"training and test instances overlap: {', '.join(pairs)}{more}. A policy must be tested "
-            "on contexts it was not trained on"
+            f"training and test instances overlap: {what}. A policy must be tested on contexts it was not trained on"
         )
 
 

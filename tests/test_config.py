@@ -21,7 +21,7 @@ from space_dist import config as configs
 from space_dist.config import RunConfig, dump, identity, load, schema
 from space_dist.config.plain_yaml import to_yaml
 from space_dist.config.reading import from_option
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, with_changes
 from tests.config_texts import Raw, leaves, replaced
 
 FOLDER = Path(__file__).parent.parent / "configs"
@@ -409,6 +409,16 @@ def test_malformed_overrides(override: str) -> None:
 def test_overrides_into_something_that_is_no_section() -> None:
     assert "--set name.x=1: 'name' is not a section" in refusal(SPACE, "name.x=1")
     assert "is not a section" in refusal(SPACE, "learner.net_arch.0=1")
+
+
+def test_a_value_that_a_sentence_names_is_known_for_an_overrides() -> None:
+    told = {"curriculum.column": "--set curriculum.column=dificulty", "seed": "--set seed=1",
+            "instances.test": "--set instances.test=sets/a_test.csv"}  # fmt: skip
+    sentence = "instances.train: /x/train.csv: row 1: there is no column 'dificulty'"
+    assert with_changes("a.yaml", sentence, told) == "a.yaml with --set curriculum.column=dificulty"
+    sentence = "overlap: of /x/a_train.csv and /x/sets/a_test.csv, by their ids: 1 is 1"
+    assert with_changes("a.yaml", sentence, told) == "a.yaml with --set instances.test=sets/a_test.csv"
+    assert with_changes("a.yaml", "there is no space for 1 more", told) == "a.yaml"
 
 
 def test_overrides_fill_a_section_that_is_empty() -> None:

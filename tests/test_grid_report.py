@@ -287,6 +287,19 @@ def test_a_threshold_within_the_noise_of_step_0_is_untestable(tmp_path: Path) ->
     assert not any("ntestable" in line for line in build_grid_report(grid, baseline="k=2").remarks)
 
 
+def test_where_runs_end_by_episodes_a_threshold_is_untestable(tmp_path: Path) -> None:
+    """A seed that never comes there has been trained for fewer steps than another: nothing counts for both."""
+    grid = make_grid(tmp_path / "g", [{"k": 1}])
+    for seed, returns in enumerate(([0.0, 1.0, 9.0], [0.5, 1.0, 2.0, 9.0])):
+        finish(grid, 0, seed, *returns)
+    [cell] = read_cells(grid, grid.manifest())
+    assert compare([cell], cell)[0].reach is not None
+    config = {**cell.cell.config, "budget": {"steps": 4000, "episodes": 30}}
+    by_episodes = dataclasses.replace(cell, cell=dataclasses.replace(cell.cell, config=config))
+    [found] = compare([by_episodes], by_episodes)
+    assert (found.reach, found.untestable) == (None, "untestable: runs end by episodes (at 2,000 to 3,000 steps)")
+
+
 # ---- odd grids ------------------------------------------------------------------------------------------------------
 
 

@@ -462,7 +462,7 @@ def test_the_command_takes_a_grid_by_each_of_its_names(uri: str, tmp_path: Path)
     ]  # fmt: skip
     by_name = CliRunner().invoke(app, ["sync", "--uri", uri, "demo", "--root", str(tmp_path / "runs")])
     answers.append(by_name.output)
-    assert all("1 runs are up to date in MLflow (0 new, 0 rows pushed" in answer for answer in answers[1:])
+    assert all("1 run is up to date in MLflow (0 new, 0 rows pushed" in answer for answer in answers[1:])
     absent = CliRunner().invoke(app, ["sync", "--uri", uri, str(tmp_path / "runs/dmo")])
     assert (absent.exit_code, "mirroring" in absent.output) == (1, False)
     assert "dmo does not exist; did you mean 'demo'?" in str(absent.exception)

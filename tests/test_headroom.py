@@ -86,7 +86,9 @@ def test_words() -> None:
     even = [state([[4, 4]], [[2, 2]]) for _ in range(3)]
     assert verdict(measured(even, 10)).startswith("Most of what is drawn teaches:")
     rare = [state([[4, 4]], [[0, 4]]) for _ in range(3)]
-    assert verdict(measured(rare, 10)).startswith("Most of what is drawn teaches little")
+    assert verdict(measured(rare, 10)).startswith("In no part of the run draws had more than 0% of the signal")
+    solved = [state([[4, 4], [4, 4], [4, 4]], [[0, 0], [2, 2], [4, 4]]) for _ in range(3)]
+    assert "draws had 133% of the signal: on a world with such a part" in verdict(measured(solved, 10))
     never = in_words(measured([state([[4, 4]], [[0, 0]])], 10))
     assert len(never) == 1
     assert "Nothing succeeded in 10 steps" in never[0]
@@ -94,6 +96,10 @@ def test_words() -> None:
     dense = [state([[4, 4]], [[0, 4]], [[4.0, 4.0]], (0.0, 0.5)) for _ in range(3)]
     assert "have returns from 0 to 0.5" in in_words(measured(dense, 10))[0]
     assert verdict(measured(dense, 10)).startswith("Most of what is drawn teaches:")
+    uneven = [state([[4, 4, 4]], [[0, 0, 4]], [[12.0, 0.0, 0.0]], (0.0, 0.5)) for _ in range(3)]
+    assert verdict(measured(uneven, 10)).startswith(
+        "Advantages differ from instance to instance, which promises nothing"
+    )
     unknown = [state([[4, 4]], [[0, 0]], known=False)]
     assert verdict(measured(unknown, 10)).startswith("Neither")
 

@@ -498,10 +498,12 @@ def test_overlap() -> None:
     refuse_overlap(doubled, apart, "train.csv", "test.csv")
     refuse_overlap(apart, doubled, "train.csv", "test.csv")
     shared = InstanceSet(np.array([70, 71]), np.array([[0.0, 9.0], [4.0, 5.0]]), ("a", "b"))
-    with pytest.raises(ConfigError, match=r"id 2 of train.csv is id 71 of test.csv\. A policy"):
+    with pytest.raises(ConfigError, match=r"of train.csv and test.csv, by their ids: 2 is 71\. A policy"):
         refuse_overlap(train, shared, "train.csv", "test.csv")
     with pytest.raises(ConfigError, match="and 2 more"):
         refuse_overlap(train, train, "train.csv", "test.csv")
+    with pytest.raises(ConfigError, match=r"overlap: both are train\.csv\. A policy"):
+        refuse_overlap(train, train, "train.csv", "train.csv")
     with pytest.raises(ConfigError, match=r"train\.csv and test\.csv have different features: a, b and a, c"):
         refuse_overlap(train, replace(apart, names=("a", "c")), "train.csv", "test.csv")
 

@@ -70,7 +70,7 @@ def test_columns_of_the_instances_reach_it(example: Path) -> None:
     )
     with pytest.raises(SpaceDistError, match="KeyError: 'effort'"):
         trained(example / "without")
-    file = example / "instances/uniform_train.csv"
+    file = example / "pointmass/uniform_train.csv"
     header, *rows = file.read_text().splitlines()
     file.write_text("\n".join([f"{header},effort", *(f"{row},{number}" for number, row in enumerate(rows))]) + "\n")
     trained(example / "with", "curriculum.columns=[effort]")

@@ -327,8 +327,9 @@ def sync(
         result = follow_runs(paths, uri, experiment)
     else:
         result = sync_runs(found.ledgers, uri, experiment, grids=found.grids, tell=say)
+    mirrored = "1 run is" if result.runs == 1 else f"{result.runs} runs are"
     console.print(
-        f"{result.runs} runs are up to date in MLflow ({result.created} new, {result.rows} rows pushed"
+        f"{mirrored} up to date in MLflow ({result.created} new, {result.rows} rows pushed"
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),
         highlight=False,
     )

@@ -107,7 +107,10 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if where == source and kind in ("extra_forbidden", "missing") and (of_kind := origins.get(f"{path[0]}.kind")):
         where = f"{source} with {of_kind}"  # by which the section has other keys than the file's
     if kind == "extra_forbidden":
-        return f"{where}: {key}: unknown key{_what_is_known(path, model, root, given)}"
+        told = f"{where}: {key}: unknown key{_what_is_known(path, model, root, given)}"
+        if where.startswith(f"{source} with "):  # what the file says of another kind
+            return f"{told}. `--set '{path[0]}={{kind: NAME}}'` puts another section in place of the file's"
+        return told
     field = _field(model, path[-1]) if model and path else None
     options = _sections(field) if field else []
     if kind == "missing":

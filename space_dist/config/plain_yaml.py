@@ -58,7 +58,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is larger than {_MAX_CONFIG_BYTES >> 10} KiB: that is no config")
     data = parse_yaml(content, str(path))
     if not isinstance(data, dict):
-        raise ConfigError(f"{path} must hold keys and values, like `name: my_run`; it holds {short(data)}")
+        it_is = "is empty" if data is None else f"holds {short(data)}"
+        raise ConfigError(f"{path} must hold keys and values, like `name: my_run`; it {it_is}")
     return data
 
 

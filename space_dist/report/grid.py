@@ -256,6 +256,9 @@ def _untestable(cell: CellRuns, threshold: float) -> str:
         return "no threshold"
     if not len(starts):
         return "no finished seed"
+    if cell.cell.config["budget"].get("episodes") is not None:  # for one that never comes there, no end is everybody's
+        ends = [run.status.steps for run in cell.configuration.finished]
+        return f"untestable: runs end by episodes (at {min(ends):,} to {max(ends):,} steps)"
     if len(starts) < 2:
         return "untestable: one seed shows no noise at step 0"
     bound = start_bound(starts)

@@ -34,7 +34,7 @@ def draw_headroom(found: Headroom, states: Sequence[WatchedState]) -> Figure:
         left.plot(ends, np.where(counted.any(axis=0), means, np.nan), color=colour, linewidth=2.2, linestyle=style,
                   label=f"{name}, mean of {len(values)} seeds")  # fmt: skip
     left.set_ylim(0.0, 1.02)
-    left.set_ylabel("share of what the best draws would give")
+    left.set_ylabel("signal, and evenness (1: all teach alike)")
     dress(left, "What uniform draws teach", over_steps=True)
     left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     if known:

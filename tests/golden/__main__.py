@@ -37,6 +37,10 @@ def main() -> None:
         cases = {name: digests for name, digests in (known | found["cases"]).items() if name in CASES}
         found = {"arithmetic": found["arithmetic"], "cases": {name: cases[name] for name in CASES}}
         DIGESTS.write_text(json.dumps(found, indent=2) + "\n")
+    known = json.loads(DIGESTS.read_text())["cases"]
+    others = [name for name, digests in found["cases"].items() if known.get(name) != digests]
+    told = f": {', '.join(others)}" if others else ""
+    sys.stderr.write(f"of {len(names)} cases {len(others)} are not the golden ones{told}\n")
     sys.stdout.write(json.dumps(found) + "\n")
 
 
