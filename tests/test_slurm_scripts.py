@@ -13,12 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from space_dist.api.grids import frozen
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import slurm_job, unheard
 from space_dist.grid.conductor import Conductor, adopt, working_on
-from space_dist.slurm import Export
+from space_dist.slurm import Export, export
 from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN
 from space_dist.slurm.node import address_facing
 from space_dist.slurm.queue import queue_of
@@ -82,6 +83,19 @@ def test_tasks_may_freeze_their_grid_all_at_once(grid: Grid, manifest: Manifest,
     assert {place.folder for place in places} == {tmp_path / "root" / manifest.name}
     assert places[0].manifest() == manifest
     assert places[0].instance_files(manifest) == grid.instance_files(manifest)
+
+
+def test_runs_go_to_the_grids_name_below_any_root(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
+    """Though the exported folder lies in the root, under another name."""
+    root = tmp_path / "s"
+    made = Export(manifest, profile(), "array", root)
+    export(made, grid.instance_files(manifest), root / "exported")
+    submitted = (root / "exported" / SUBMIT).read_text()
+    assert f"\ngrid={root / manifest.name}\n" in submitted
+    for _ in range(2):  # the second task finds what the first has frozen
+        assert frozen(root / "exported/manifest.json", root)[0].folder == root / manifest.name
+    assert frozen(root / manifest.name / "manifest.json", root)[0].folder == root / manifest.name
+    assert frozen(root / "exported", root)[0].folder == root / "exported"  # a folder is meant as it is named
 
 
 # ---- what the scripts do --------------------------------------------------------------------------------------------

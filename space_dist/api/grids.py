@@ -116,12 +116,13 @@ def frozen(
     scale: the share of the seeds and steps in YAML. changes: `KEY=VALUE` for every cell of it.
     """
     if path.is_dir() or path.name == MANIFEST:
-        source = find_grid(path, root, scale, changes)
-        place = source if source.folder.parent == root or path.is_dir() else adopt(source, root)
+        place = find_grid(path, root, scale, changes)
         manifest = place.manifest()
         if manifest.search is not None:
             raise ConfigError(f"{place.folder} holds a search: space-dist tune run {place.folder}")
-        return place, manifest
+        if not path.is_dir():
+            place = adopt(place, root)
+        return place, place.manifest()
     from space_dist.grid.planning import plan  # imports torch, to see whether every cell can learn
 
     made = plan(path, root, scale, changes)
