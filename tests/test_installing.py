@@ -179,6 +179,7 @@ def test_a_new_project_runs_as_it_is_written(
     mine = tmp_path / "mine"
     assert command(monkeypatch, "init", mine) == 0
     assert f"Next: cd {mine}" in capsys.readouterr().out
+    assert load_profile(mine / "slurm.yaml").env == {"PYTHONPATH": str(mine)}  # jobs start elsewhere
     monkeypatch.chdir(mine)
     monkeypatch.delitem(sys.modules, "slider", raising=False)
     page = (mine / "README.md").read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import re
 import shutil
@@ -22,6 +23,7 @@ from space_dist.grid.planning import plan
 from space_dist.slurm import Export, Mode, Profile, export, load_profile
 from space_dist.slurm.export import AGGREGATE, SUBMIT, TRAIN, render
 from space_dist.slurm.profile import seconds
+from tests.commanding import command
 from tests.patience import PATIENCE
 from tests.slurm.profiles import exports
 
@@ -404,6 +406,47 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
     assert (code, "did you mean 'array'?" in said) == (2, True)
     code, said = run("grid", "run", out, "--part", "0-0", "--runs", "0123456789abcdef")
     assert (code, "export the grid again" in said) == (2, True)
+
+
+@pytest.mark.parametrize("name", ["mine", 'my "own" it\'s {x}: #1'])
+def test_a_module_that_no_job_would_find_is_told(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / name
+    monkeypatch.chdir(tmp_path)
+    assert command(monkeypatch, "init", name) == 0
+    if name != "mine":  # a folder of this name cannot be one of PYTHONPATH
+        assert "\n# env: { PYTHONPATH" in (mine / "slurm.yaml").read_text()
+        mine = mine.rename(tmp_path / name.replace(":", ""))
+        shutil.rmtree(mine)
+        assert command(monkeypatch, "init", mine) == 0
+    monkeypatch.chdir(mine)
+    monkeypatch.delitem(sys.modules, "slider", raising=False)
+    assert load_profile(Path("slurm.yaml")).env == {"PYTHONPATH": str(mine)}
+
+    def told(*words: object, grid: Path = mine / "grid.yaml") -> str:
+        capsys.readouterr()
+        assert command(monkeypatch, "slurm", "export", grid, "--out", tmp_path / "out", *words) == 0
+        return " ".join(capsys.readouterr().err.split())
+
+    without = told()
+    assert f"warning: the grid imports 'slider', which is found in {mine} alone, where no job looks" in without
+    (line,) = re.findall(r"into the profile, (env: .+}), and export again; or install it", without)
+    (tmp_path / "site.yaml").write_text(f"{line}\n")
+    assert load_profile(tmp_path / "site.yaml").env == {"PYTHONPATH": str(mine)}
+    readme = (tmp_path / "out/README.md").read_text()
+    assert "Not in this folder is code of your own that runs import: slider." in readme
+    assert "imports" not in told("--profile", tmp_path / "site.yaml")
+    assert "imports" not in told("--profile", mine / "slurm.yaml")
+    assert "imports" not in told("--set", "prologue=[export PYTHONPATH=/mine]")
+    said = told("--set", f"env.PYTHONPATH={tmp_path}")  # where it is not
+    assert f"{json.dumps(f'{tmp_path}:{mine}', ensure_ascii=False)}}}, and export" in said
+    said = told("--set", "env.PYTHONPATH=/of/the/cluster")
+    assert "env.PYTHONPATH names /of/the/cluster, which is not here: whether" in said
+    monkeypatch.chdir(tmp_path)
+    assert "'slider', which is not found here. Write" in told(grid=tmp_path / "out")
+    monkeypatch.setenv("PYTHONPATH", str(mine))  # which sbatch hands on
+    assert "imports" not in told(grid=tmp_path / "out")
 
 
 # ---- nothing a value holds can do anything --------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def slurm_export(
     tasks = f"{made.n_tasks} array tasks" if mode == "array" else f"one job of {site.nodes} nodes"
     at_most = "" if manifest.search is None else "at most "
     say(f"{manifest.name}: {at_most}{made.n_runs} runs in {tasks}; {out / 'README.md'} says what to do with it")
-    if remark := made.tracking_remark(out):
+    for remark in filter(None, (made.tracking_remark(out), made.import_remark())):
         warn(f"warning: {remark}")
     if check:
         _check(out, made.scripts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 from pathlib import Path
@@ -13,6 +14,8 @@ from space_dist.cli.terminal import delivered, say, write
 from space_dist.errors import ConfigError
 
 _PROJECT = Path(__file__).with_name("project")
+_PROFILE, _NO_FOLDER = "slurm.yaml", "# env: { PYTHONPATH: /home/me/my_project }"
+_MAX_PATH = 1000  # characters of a value in a profile
 _DISGUISE = ".in"  # of files that would be taken for this package's own
 
 
@@ -82,6 +85,15 @@ def init(
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
             say(str(target))
+        _name_in_profile(folder)
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
     say(f"Next: cd {shlex.quote(str(folder))} && space-dist train slider.yaml   (README.md says what else)")
+
+
+def _name_in_profile(folder: Path) -> None:
+    """Have jobs look for modules in the project. A folder that PYTHONPATH cannot name is left to its user."""
+    path, profile = str(folder.resolve() if ".." in folder.parts else folder.absolute()), folder / _PROFILE
+    if path.isprintable() and ":" not in path and len(path) <= _MAX_PATH:
+        line = f"env: {{ PYTHONPATH: {json.dumps(path, ensure_ascii=False)} }}"
+        profile.write_text(profile.read_text(encoding="utf-8").replace(_NO_FOLDER, line), encoding="utf-8")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import re
 import shlex
 import traceback
@@ -20,12 +21,14 @@ import jinja2
 import jinja2.meta
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
+from space_dist import config as configs
 from space_dist.config import clean
 from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.slurm.arrays import Array, arrays_of
 from space_dist.slurm.profile import Profile, variables_in
 from space_dist.system.files import atomic_write
+from space_dist.system.importing import found_in, lost_elsewhere
 
 Mode = Literal["array", "cluster"]
 TRAIN, SUBMIT, README = "train.sbatch", "submit.sh", "README.md"
@@ -93,6 +96,36 @@ class Export:
             "grid's file, or MLFLOW_TRACKING_URI, to "
             f"http(s)://HOST:PORT or sqlite:///{results}/mlflow.db, and export again; or tracking.uri: null, and "
             "`space-dist sync` later"
+        )
+
+    @property
+    def own_modules(self) -> list[str]:
+        """The top-level modules of users' own that runs import: no folder of an export has them."""
+        found = (configs.parse(cell.config, f"cell {cell.id}").import_paths for cell in self.manifest.cells)
+        return sorted({path.partition(":")[0].partition(".")[0] for paths in found for path in paths})
+
+    def import_remark(self) -> str | None:
+        """What is to be known of modules that this machine finds only here, and jobs maybe nowhere."""
+        if any("PYTHONPATH" in line for line in self.profile.prologue):
+            return None
+        given = self.profile.env.get("PYTHONPATH", "")
+        folders = [folder for folder in given.split(":") if folder]
+        lost = lost_elsewhere(name for name in self.own_modules if not found_in(name, folders))
+        if not lost:
+            return None
+        kind, names = "grid" if self.manifest.search is None else "search", ", ".join(map(repr, lost))
+        if unseen := [folder for folder in folders if not Path(folder).is_dir()]:
+            return (
+                f"the {kind} imports {names}, and env.PYTHONPATH names {unseen[0]}, which is not here: whether the "
+                "nodes find it there cannot be told"
+            )
+        here = str(Path.cwd())
+        is_here = all(found_in(name, [here]) for name in lost)
+        line = json.dumps({"PYTHONPATH": ":".join([*folders, here if is_here else "/FOLDER"])}, ensure_ascii=False)
+        where = f"found in {here} alone, where no job looks" if is_here else "not found here"
+        return (
+            f"the {kind} imports {names}, which is {where}. Write the folder, which all nodes must see, into the "
+            f"profile, env: {line}, and export again; or install it beside space-dist on the nodes"
         )
 
     @property
@@ -354,6 +387,7 @@ def _values(grid: Export) -> dict[str, Any]:
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "ray_tries": _RAY_TRIES,
         "stop_seconds": round(manifest.resources.grace_seconds) + 60,
+        "own_modules": grid.own_modules,
         "sync": manifest.tracking.anywhere,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
         "env": {_Safe(name): value for name, value in profile.env.items()},

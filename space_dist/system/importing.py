@@ -15,6 +15,7 @@ import importlib.metadata
 import importlib.util
 import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,6 +25,8 @@ from space_dist.errors import ConfigError, nearest
 PYTHON = (sys.executable, "-P")
 """How a Python of ours is started: -P keeps what happens to lie in the current folder from being imported first."""
 
+_LOOKED_FOR = "import importlib.util, sys; print(*(m for m in sys.argv[1:] if not importlib.util.find_spec(m)))"
+_SECONDS = 60.0  # for a Python that imports nothing
 _OURS = "space_dist"
 _CARL = "carl"
 _COMES_WITH_PYTHON = ("pip", "setuptools", "wheel")
@@ -51,6 +54,28 @@ def folders_of_user() -> list[str]:
     # Other nodes have a Python of their own, at these or other places.
     pythons = (sys.prefix, sys.base_prefix)
     return [entry for entry in found if entry == here or not any(map(Path(entry).is_relative_to, pythons))]
+
+
+def found_in(module: str, folders: Iterable[str]) -> bool:
+    """Whether one of these folders has a module, or a package, of this top-level name."""
+    return importlib.machinery.PathFinder.find_spec(module, list(folders)) is not None
+
+
+def lost_elsewhere(modules: Iterable[str]) -> list[str]:
+    """Those of these top-level modules that a Python like this one does not find, started in another folder.
+
+    What is installed, in whatever way, and what PYTHONPATH names from / on is found. Imports nothing.
+    """
+    names = sorted(set(modules))
+    if not names:
+        return []
+    try:
+        asked = subprocess.run(
+            [*PYTHON, "-c", _LOOKED_FOR, *names], cwd="/", capture_output=True, text=True, timeout=_SECONDS, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return []  # nobody can tell
+    return asked.stdout.split()
 
 
 def load(import_path: str, key: str, *, of_library: type | None = None) -> object:
