@@ -421,7 +421,7 @@ def test_a_stopped_run_lacks_no_explanation(
     assert said[Cause.STOPPED].rstrip().endswith("waiting: stopped")
     what, way = said[Cause.KILLED].splitlines()
     assert what.endswith("failed: killed by an unknown hand; no more is known")
-    assert way == f"`space-dist grid retry {grid.folder} --cause killed` lets it be tried again"
+    assert way == f"`space-dist grid retry {grid.folder} --cause killed` gives another try"
 
 
 def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:

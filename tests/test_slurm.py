@@ -592,7 +592,10 @@ def test_commands_of_the_readme_do_nothing_else_when_pasted(manifest: Manifest, 
         assert not canary.exists(), value
         asked = [call[1:] for call in stand_ins.calls("space-dist")]
         results = str(root / manifest.name)
-        assert asked == [["grid", "status", results], ["sync", results, "--uri", "URI"], ["grid", "stop", results]]
+        assert asked == [
+            ["grid", "status", results], ["sync", results, "--uri", "URI"], ["grid", "stop", results],
+            ["grid", "retry", results, "--cause", "CAUSE"],
+        ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,13 @@ from space_dist.api.grids import frozen
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.manifest import Grid, Manifest, Run
-from space_dist.experiment.status import slurm_job, unheard
+from space_dist.experiment.status import Attempts, slurm_job, unheard
 from space_dist.grid.conductor import Conductor, adopt, working_on
 from space_dist.slurm import Export, export
 from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN
 from space_dist.slurm.node import address_facing
 from space_dist.slurm.queue import queue_of
+from tests.commanding import command
 from tests.patience import PATIENCE
 from tests.test_slurm import Stubs, grid, manifest, profile, short, stubs, write  # noqa: F401
 
@@ -286,6 +287,57 @@ def test_submission_is_all_or_nothing_and_happens_once(manifest: Manifest, stubs
     assert stubs.calls("sbatch") == []
     assert stubs.run(folder / SUBMIT, STUB_QUEUE="99\n1030\n")[0] == 0  # others' jobs, and its own are over
     assert len(stubs.calls("sbatch")) == 4
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "not_said"),
+    [
+        ("0", "", "./submit.sh"),
+        ("1", "runs failed for good (how many, and why: see above), which ./submit.sh does not try again; "
+              "`space-dist grid retry {folder} --cause CAUSE` gives them another try, then ./submit.sh", "see above);"),
+        ("3", "the grid is not complete (see above); ./submit.sh goes on with it", "retry"),
+    ],
+)  # fmt: skip
+def test_what_gathers_results_says_how_the_grid_goes_on(
+    code: str, said: str, not_said: str, manifest: Manifest, stubs: Stubs, tmp_path: Path
+) -> None:
+    folder = write(Export(manifest, profile(), "array"), tmp_path / "x")
+    got, told = stubs.run(folder / AGGREGATE, STUB_CODE=code)
+    assert got == int(code)
+    assert said.format(folder=folder) in told
+    assert not_said not in told
+
+
+def test_a_failed_run_of_an_exported_grid_is_tried_again_by_submit_sh(
+    grid: Grid, manifest: Manifest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = Grid(tmp_path / "my grid")
+    export(Export(manifest, profile(), "array"), grid.instance_files(manifest), place.folder)
+    for run in manifest.runs()[:2]:
+        attempts = Attempts(place.ledger(run))
+        attempts.begin(1, {})
+        attempts.end(1, Ended(Cause.CRASH, "made to"))
+    assert command(monkeypatch, "grid", "status", place.folder, "--by-cause") == 1
+    told = " ".join(capsys.readouterr().out.split())
+    again = f"`space-dist grid retry '{place.folder}' --cause crash` gives another try"
+    assert f"2 runs failed for good; {again}" in told
+    assert command(monkeypatch, "grid", "retry", place.folder, "--cause", "crash") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"2 runs may be tried again; `'{place.folder / SUBMIT}'`, on SLURM, or" in told
+    (place.folder / SUBMIT).unlink()  # as below another root, where only the jobs' numbers are
+    (place.folder / JOBS).touch()
+    attempts.begin(2, {})
+    attempts.end(2, Ended(Cause.CRASH, "made to"))
+    assert command(monkeypatch, "grid", "retry", place.folder, "--cause", "crash") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "1 run may be tried again; `./submit.sh` of the exported folder, on SLURM, or" in told
+
+
+def test_submit_sh_says_what_was_asked_for(manifest: Manifest, stubs: Stubs, tmp_path: Path) -> None:
+    folder = write(Export(manifest, profile(), "array"), tmp_path / "x")
+    assert f"submitted {manifest.name}, 6 runs in all; results: {folder}\n" in stubs.run(folder / SUBMIT)[1]
+    told = stubs.run(folder / SUBMIT, "--array=0-1", "--hold")[1]
+    assert f"submitted {manifest.name}, 6 runs in all, with --array=0-1 --hold; results" in told
 
 
 def test_what_slurm_knows_is_asked_once(stubs: Stubs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import logging
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -315,7 +316,8 @@ def grid_stop(
     place.stop_file.touch()
     for run_status in live:  # those nobody conducts any more, too
         run_status.ledger.stop_file.touch()
-    say(f"{manifest.name}: {len(live)} runs were asked to make a checkpoint and end")
+    were = "was" if len(live) == 1 else "were"
+    say(f"{manifest.name}: {_of(len(live), 'run')} {were} asked to make a checkpoint and end")
     if queue and queue.live:
         say("SLURM jobs that still wait will end as soon as they start; scancel removes them")
 
@@ -346,10 +348,26 @@ def grid_retry(
             Attempts(run_status.ledger).forgive()
             say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
             forgiven += 1
-    how = f"`space-dist grid run {grid if grid.is_file() else place.folder}` or `grid submit` does it"
-    if not grid.is_file():
-        how += ", as the grid was frozen; what has changed in its YAML file comes in when that file is run"
-    say(f"{forgiven} runs may be tried again{f'; {how}' if forgiven else ''}")
+    say(f"{_of(forgiven, 'run')} may be tried again{f'; {_how_again(grid, place, manifest)}' if forgiven else ''}")
+
+
+def _how_again(named: Path, place: Grid, manifest: Manifest) -> str:
+    """Which commands go on with what may be tried again. named: the grid, as its user did."""
+    from space_dist.slurm.export import JOBS, SUBMIT
+
+    if manifest.search is not None:
+        ways = [f"`space-dist tune run {shlex.quote(str(place.folder))}`"]
+    else:
+        ways = [f"`space-dist grid run {named if named.is_file() else place.folder}`", "`grid submit`"]
+    script = place.folder / SUBMIT
+    if script.is_file():
+        ways = [f"`{shlex.quote(str(script))}`, on SLURM,", *ways]
+    elif (place.folder / JOBS).exists():  # it was exported with --root
+        ways = [f"`./{SUBMIT}` of the exported folder, on SLURM,", *ways]
+    how = f"{' or '.join(ways)} does it"
+    if named.is_file() or manifest.search is not None:
+        return how
+    return f"{how}, as the grid was frozen; what has changed in its YAML file comes in when that file is run"
 
 
 def _unreadable(run_status: RunStatus) -> str:

@@ -171,6 +171,8 @@ def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
                 if run_status.cause is cause:
                     run = run_status.run
                     say(f"  {run.title} ({run.cell.id}): {run_status.condition}{_why(run_status)}")
+        for way, count in Counter(one.way_out for one in unwell if one.condition == "failed").items():
+            say(f"{count} {'run' if count == 1 else 'runs'} failed for good; {way}")
         return
     for run_status in unwell[:_SHOWN_RUNS]:
         say(f"{run_status.run.title}: {run_status.in_words}{_why(run_status)}")

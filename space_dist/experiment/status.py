@@ -181,7 +181,7 @@ class RunStatus:
         again = f"`space-dist grid retry {shlex.quote(str(folder.parent.parent))} --cause {self.cause}`"
         if self.cause is Cause.UNREADABLE:
             return f"restore what cannot be read, and {again} lets it go on; or remove {folder}, and it begins anew"
-        return f"{again} lets it be tried again"
+        return f"{again} gives another try"
 
     @property
     def in_words(self) -> str:

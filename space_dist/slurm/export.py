@@ -364,7 +364,7 @@ def _environment(templates: Path | None) -> jinja2.Environment:
         loader=loader, undefined=jinja2.StrictUndefined, finalize=_quoted, trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True, autoescape=False,
     )  # fmt: skip
-    made.globals["shell_line"] = _shell_line
+    made.globals |= {"shell_line": _shell_line, "counted": _counted}
     return made
 
 
@@ -401,6 +401,10 @@ def _values(grid: Export) -> dict[str, Any]:
 def _shell_line(*words: object) -> _Safe:
     """A line that can be pasted into a shell: each of its words is one, whatever it holds."""
     return _Safe(f"{shlex.join(map(str, words)):<44}")
+
+
+def _counted(number: int, what: str) -> _Safe:
+    return _Safe(f"{number:,} {what}{'' if number == 1 else 's'}")
 
 
 def _quoted(value: Any) -> Any:

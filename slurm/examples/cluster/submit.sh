@@ -1,5 +1,6 @@
 #!/bin/bash
 # Submits the grid pointmass_small to SLURM, or goes on with it: what is done stays done.
+# What failed for good stays so, too, until `space-dist grid retry` gives it another try.
 # Options, if any, go to sbatch for training and win over train.sbatch: ./submit.sh --partition=other
 # shellcheck disable=SC1003,SC2016,SC2088 # values are quoted whole, whatever they hold
 set -euo pipefail
@@ -46,4 +47,4 @@ submit train "$@" train.sbatch
 submit aggregate --dependency=afterany:"$(IFS=: && echo "${submitted[*]}")" aggregate.sbatch
 mv -f -- "$jobs.new" "$jobs"
 trap - EXIT
-echo "submitted 6 runs; results: $grid"
+echo "submitted pointmass_small, 6 runs in all${*:+, with $*}; results: $grid"
