@@ -25,7 +25,8 @@ from space_dist.slurm.node import address_facing
 from space_dist.slurm.queue import queue_of
 from tests.commanding import command
 from tests.patience import PATIENCE
-from tests.test_slurm import Stubs, grid, manifest, profile, short, stubs, write  # noqa: F401
+from tests.test_slurm import GRID, Stubs, grid, manifest, profile, short, stubs, write  # noqa: F401
+from tests.tunes import write_tune
 
 # ---- what a task does -----------------------------------------------------------------------------------------------
 
@@ -287,6 +288,28 @@ def test_submission_is_all_or_nothing_and_happens_once(manifest: Manifest, stubs
     assert stubs.calls("sbatch") == []
     assert stubs.run(folder / SUBMIT, STUB_QUEUE="99\n1030\n")[0] == 0  # others' jobs, and its own are over
     assert len(stubs.calls("sbatch")) == 4
+
+
+def test_an_exported_folder_says_where_its_results_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, root, tune = tmp_path / "out", tmp_path / "my results", write_tune(tmp_path / "tune")
+
+    def told(*words: object) -> str:
+        capsys.readouterr()
+        assert command(monkeypatch, *words) in (0, 3)
+        return " ".join(capsys.readouterr().err.split())
+
+    for what, name, asked in ((GRID, "pointmass_small", "grid"), (tune, "search", "tune")):
+        export_it = ("slurm", "export", what, "--out", out / asked)
+        told(*export_it, "--root", root)
+        said = f"{out / asked} was exported with --root, and holds no results: name '{root / name}' instead"
+        assert said in told(asked, "status", out / asked)
+        assert said in told("grid", "stop", out / asked)
+        told(*export_it)
+        assert "exported" not in told(asked, "status", out / asked)
+        told("slurm", "export", what, "--out", out / name, "--root", out)  # itself
+        assert "exported" not in told(asked, "status", out / name)
 
 
 @pytest.mark.parametrize(

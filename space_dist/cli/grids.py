@@ -476,7 +476,19 @@ def _found(
     from space_dist.experiment.manifest import find_grid
 
     place = find_grid(path, root_of(root), scale, changes)
+    tell_results_elsewhere(place)
     return place, place.manifest()
+
+
+def tell_results_elsewhere(place: Grid) -> None:
+    """Say where the results are of a folder that was exported for SLURM with another root, and holds none."""
+    from space_dist.slurm.export import results_elsewhere
+
+    if (results := results_elsewhere(place.folder)) is not None:
+        warn(
+            f"{place.folder} was exported with --root, and holds no results: name {shlex.quote(str(results))} instead, "
+            "where they are"
+        )
 
 
 def mode_of(text: str) -> Mode:

@@ -26,6 +26,7 @@ from space_dist.cli.grids import (
     root_of,
     run_statuses_of,
     started_ahead,
+    tell_results_elsewhere,
 )
 from space_dist.cli.overview import Watching, display, print_failures, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
@@ -127,6 +128,7 @@ def tune_status(
     from space_dist.slurm.queue import WatchedQueue
 
     place = find_tune(tune, root_of(root))
+    tell_results_elsewhere(place)
     watched, watching = WatchedQueue(place.folder), Watching()
     while True:
         queue = watched.now()

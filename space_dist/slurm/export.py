@@ -27,7 +27,7 @@ from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.slurm.arrays import Array, arrays_of
 from space_dist.slurm.profile import Profile, variables_in
-from space_dist.system.files import atomic_write
+from space_dist.system.files import atomic_write, read_file
 from space_dist.system.importing import found_in, lost_elsewhere
 
 Mode = Literal["array", "cluster"]
@@ -36,7 +36,9 @@ AGGREGATE = "aggregate.sbatch"  # once, after a grid's training
 ADVANCE = "advance.sbatch"  # after each generation of a search
 NEXT = "slurm_next.txt"  # in a search's folder: what is to be submitted next, while that is being done
 JOBS = "slurm_jobs.txt"  # in the grid's folder: `<job id> <what it is>` a line, of the last submission
+RESULTS = "slurm_results.txt"  # in an exported folder whose results go elsewhere (--root): where to
 _MAX_ARRAYS = 1000
+_MAX_NOTE_BYTES = 8 << 10  # longer than any path
 _CHECKPOINT_SECONDS = 10  # beside the grace time: to notice the signal, and to get back into the queue
 _RAY_TRIES = 3  # in a row, without a run that began: then what keeps Ray from coming up will not go away by itself
 _PLAIN = re.compile(r"[A-Za-z0-9@%+,.:/_-]+")
@@ -259,12 +261,33 @@ def export(
             if name == SUBMIT:
                 (folder / name).chmod(0o755)
             written.append(folder / name)
+        written += _note_results(grid, folder)
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
     # Last: a folder with a manifest has all its scripts.
     if not known or grid.manifest.search is None:
         there.freeze(grid.manifest, instances)
     return [*written, there.manifest_file]
+
+
+def _note_results(grid: Export, folder: Path) -> list[Path]:
+    """Have the exported folder know where its results are, if not in itself; returns what was written."""
+    note = folder / RESULTS
+    results = None if grid.root is None else grid.root / grid.manifest.name
+    if results is None or results.resolve() == folder.resolve():
+        note.unlink(missing_ok=True)  # of an export before
+        return []
+    atomic_write(note, f"{results}\n".encode())
+    return [note]
+
+
+def results_elsewhere(folder: Path) -> Path | None:
+    """Where the results of an exported folder are, if it was exported with another root."""
+    try:
+        path = Path(read_file(folder / RESULTS, _MAX_NOTE_BYTES).decode().strip())
+    except (OSError, UnicodeDecodeError):
+        return None
+    return path if path.is_absolute() and str(path).isprintable() else None
 
 
 def _holds(there: Grid, manifest: Manifest) -> bool:
