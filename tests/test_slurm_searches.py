@@ -339,6 +339,24 @@ def test_a_search_ends_with_the_same_bytes(
     assert "generation 3 of 3" in said
     assert "12 of 12 trials asked" in said
     assert tasks_done >= 12
+    (told,) = re.findall(
+        r"^space-dist (slurm export .*) --profile PROFILE +#", (grid.folder / README).read_text(), re.M
+    )
+    assert command(monkeypatch, "tune", "report", grid.folder) == 0
+    beside = tmp_path / "search-confirm"
+    assert f"looked for in {beside}" in " ".join(capsys.readouterr().out.split())
+    (grid.folder / JOBS).touch()
+    assert command(monkeypatch, "tune", "confirm", grid.folder) == 0
+    typed_there = f"slurm export {grid.folder / 'confirm/search-confirm.yaml'} --out {beside}`"
+    assert typed_there in " ".join(capsys.readouterr().out.split())
+    monkeypatch.chdir(grid.folder)
+    assert command(monkeypatch, *told.split()) == 0
+    confirming = Grid(beside)
+    for run in confirming.manifest().runs():
+        end(confirming, run, 40.0 + run.seed)
+    capsys.readouterr()
+    assert command(monkeypatch, "tune", "report", grid.folder) == 0
+    assert "Confirmed with fresh seeds" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.fixture

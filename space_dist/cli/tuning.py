@@ -186,7 +186,8 @@ def tune_report(
 @tune_app.command("confirm")
 def tune_confirm(tune: TunePath, root: Root = None) -> None:
     """Write the grid that runs the best setting of each arm with fresh seeds on the final instances."""
-    from space_dist.experiment.tuning import find_tune
+    from space_dist.experiment.tuning import confirmation_of, find_tune
+    from space_dist.slurm.export import JOBS
 
     with needed_from("tune", "a search"):
         from space_dist.grid.tuning import confirmation
@@ -199,6 +200,9 @@ def tune_confirm(tune: TunePath, root: Root = None) -> None:
         best = search.best(arm)
         say(f"{arm}: trial {best.number if best is not None else ''}")
     say(f"`space-dist grid run {written} --root {place.folder.parent}` runs it; `space-dist tune report` shows it")
+    if (place.folder / JOBS).exists():
+        beside = place.folder.with_name(confirmation_of(manifest.name))
+        say(f"on SLURM: `space-dist slurm export {written} --out {beside}`, with your --profile, then its submit.sh")
 
 
 def tell_outcome(place: Grid, manifest: Manifest) -> None:

@@ -278,7 +278,8 @@ def _confirmation(
     if not search.over:
         return [], None, f"{none}: `space-dist tune run {grid.folder}` goes on, and what it chooses is confirmed then."
     if not confirming.manifest_file.exists():
-        return [], None, f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it."
+        where = f"whose runs are looked for in {confirming.folder}"
+        return [], None, f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it, {where}."
     try:
         found = confirming.manifest()
     except LedgerError as error:

@@ -25,6 +25,7 @@ from space_dist import config as configs
 from space_dist.config import clean
 from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment.manifest import Grid, Manifest
+from space_dist.experiment.tuning import confirmation_of
 from space_dist.slurm.arrays import Array, arrays_of
 from space_dist.slurm.profile import Profile, variables_in
 from space_dist.system.files import atomic_write, read_file
@@ -410,7 +411,7 @@ def _values(grid: Export) -> dict[str, Any]:
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "ray_tries": _RAY_TRIES,
         "stop_seconds": round(manifest.resources.grace_seconds) + 60,
-        "own_modules": grid.own_modules,
+        "own_modules": grid.own_modules, **_confirmation(grid),
         "sync": manifest.tracking.anywhere,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
         "env": {_Safe(name): value for name, value in profile.env.items()},
@@ -419,6 +420,16 @@ def _values(grid: Export) -> dict[str, Any]:
         "prologue": [_Safe(line) for line in profile.prologue], "command": profile.command,
         "interface": profile.interface, "temp": profile.temp,
     }  # fmt: skip
+
+
+def _confirmation(grid: Export) -> dict[str, str]:
+    """The file of the grid that confirms a search, and where `tune report` looks for its runs: beside the search's."""
+    name = confirmation_of(grid.manifest.name)
+    folder, beside = (".", "..") if grid.root is None else (str(grid.root / grid.manifest.name), str(grid.root))
+    return {
+        "confirmation": str(PurePosixPath(folder, "confirm", f"{name}.yaml")),
+        "confirmed_in": str(PurePosixPath(beside, name)),
+    }
 
 
 def _shell_line(*words: object) -> _Safe:
