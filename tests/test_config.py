@@ -316,7 +316,7 @@ def test_unknown_kinds_list_what_is_known() -> None:
         ("evaluation", "", "evaluation: the section is empty: give it keys and values, or leave the key out. Allowed "
                            "here: every_steps, episodes, legacy_metric"),
         ("env.kwargs", "", "env.kwargs: is empty; give it keys and values, or leave the key out"),
-        ("schedule", "", "schedule: is empty; give it a list, or leave the key out"),
+        ("schedule", "", "schedule: is empty; give it a list, [] for none, or leave the key out"),
         ("schedule", "[null]", "schedule.0: the section is empty: it needs steps and set"),
     ],
 )  # fmt: skip

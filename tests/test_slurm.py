@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -186,6 +187,17 @@ def test_the_commented_profile_names_every_field() -> None:
         (["env={A-B: x}"], ["env", "no name of an environment variable"]),
         (["env={RAY_AUTH_TOKEN: x}"], ["RAY_AUTH_TOKEN", "set by SLURM or by these scripts"]),
         (["env={scratch: /home/me}"], ["env: scratch is set by SLURM or by these scripts"]),
+        (
+            ["env.OMP_NUM_THREADS=1"],
+            [
+                '--set env.OMP_NUM_THREADS=1: env: OMP_NUM_THREADS: 1 is no text; write it in quotes, OMP_NUM_THREADS: "1",',
+                "or --set 'env.OMP_NUM_THREADS=\"1\"'",
+            ],
+        ),
+        (["env={A: true}"], ['env: A: true is no text; write it in quotes, A: "true"']),
+        (["env={A: }"], ["env: A is empty"]),
+        (["modules=null"], ["modules: is empty; give it a list, [] for none, or leave the key out"]),
+        (["command=null"], ["command: is empty; give it a list, or leave the key out"]),
         (["env={UID: '0'}"], ["env: UID is bash's own"]),
         (["env={BASH_ENV: /x}"], ["BASH_ENV is bash's own"]),
         (["env={POSIXLY_CORRECT: '1'}"], ["POSIXLY_CORRECT is bash's own"]),
@@ -206,6 +218,14 @@ def test_a_wrong_profile_is_refused_in_a_sentence(settings: list[str], said: lis
         load_profile(None, settings)
     for part in said:
         assert part in str(caught.value)
+
+
+def test_what_is_told_of_a_number_for_a_variable_is_taken() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_profile(None, ["env.OMP_NUM_THREADS=1"])
+    (told,) = re.findall(r"or (--set .*)$", str(caught.value))
+    assert load_profile(None, shlex.split(told)[1:]).env == {"OMP_NUM_THREADS": "1"}
+    assert load_profile(None, ["modules=[]"]).modules == ()
 
 
 def test_what_does_not_go_together_is_refused(manifest: Manifest) -> None:

@@ -124,7 +124,8 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         named = [one for one in (*options, model) if one and one.__name__ == context.get("class_name")]
         return f"{where}: {key or 'the whole file'}: {_no_section(given, named or options)}"
     if given is None and kind in ("dict_type", "tuple_type"):
-        what = "keys and values" if kind == "dict_type" else "a list"
+        may_be_empty = field is not None and not any(getattr(limit, "min_length", 0) for limit in field.metadata)
+        what = "keys and values" if kind == "dict_type" else "a list, [] for none" if may_be_empty else "a list"
         way_out = "" if field and field.is_required() else ", or leave the key out"
         return f"{where}: {key}: is empty; give it {what}{way_out}"
     if kind in ("union_tag_invalid", "union_tag_not_found"):

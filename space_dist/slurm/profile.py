@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib.resources
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -210,6 +211,20 @@ class Profile(Section):
             if (field := _meant(name, [one.replace("_", "-") for one in cls.model_fields])) is not None:
                 raise ValueError(f"--{name}{_in_full(name, field)} has a field of its own: {field.replace('-', '_')}")
         return lines
+
+    @field_validator("env", mode="before")
+    @classmethod
+    def _texts(cls, variables: Any) -> Any:
+        """No number is taken for its text: YAML makes 10 of 010, and 1.1 of 1.10, and nobody would see that."""
+        for name, value in variables.items() if isinstance(variables, dict) else ():
+            if isinstance(value, int | float):
+                text = json.dumps(value)
+                raise ValueError(
+                    f'{name}: {text} is no text; write it in quotes, {name}: "{text}", or --set \'env.{name}="{text}"\''
+                )
+            if value is None:
+                raise ValueError(f'{name} is empty; write {name}: "" for a variable without a text, or leave it out')
+        return variables
 
     @field_validator("env")
     @classmethod
