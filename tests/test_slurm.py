@@ -167,7 +167,7 @@ def test_the_commented_profile_names_every_field() -> None:
     [
         (["partitoin=x"], ["partitoin", "did you mean 'partition'?"]),
         (["time=soon"], ["time", "'soon'", "HH:MM:SS"]),
-        (["time=1"], ["time (60 s)", "signal.lead_seconds (120 s)"]),
+        (["time=1"], ["time (60 s)", "signal.lead_seconds (120 s)", "back into the queue as soon as it begins"]),
         (["mem=3 GB"], ["mem", "3 GB"]),
         (["mem=3G", "mem_per_cpu=1G"], ["mem and mem_per_cpu exclude each other"]),
         (["extra=[--partition=x]"], ["--partition has a field of its own: partition"]),
@@ -190,7 +190,8 @@ def test_the_commented_profile_names_every_field() -> None:
         (
             ["env.OMP_NUM_THREADS=1"],
             [
-                '--set env.OMP_NUM_THREADS=1: env: OMP_NUM_THREADS: 1 is no text; write it in quotes, OMP_NUM_THREADS: "1",',
+                "--set env.OMP_NUM_THREADS=1: env: OMP_NUM_THREADS: 1 is no text; write it in quotes",
+                ', OMP_NUM_THREADS: "1", ',
                 "or --set 'env.OMP_NUM_THREADS=\"1\"'",
             ],
         ),
@@ -218,6 +219,17 @@ def test_a_wrong_profile_is_refused_in_a_sentence(settings: list[str], said: lis
         load_profile(None, settings)
     for part in said:
         assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("time", "lead", "told"), [(3, 120, True), ("3:01", 120, False), ("5:00", 240, True), (None, 120, False)]
+)
+def test_a_time_limit_that_is_announced_at_once_is_told(
+    time: str | int | None, lead: int, told: bool, manifest: Manifest
+) -> None:
+    said = Export(manifest, profile(time=time, signal={"lead_seconds": lead}), "array").time_remark()
+    assert (said is not None) == told
+    assert said is None or f"{lead} s before (signal.lead_seconds), or up to 60 s sooner" in said
 
 
 def test_what_is_told_of_a_number_for_a_variable_is_taken() -> None:
@@ -643,6 +655,37 @@ def test_a_check_tells_an_objection_from_an_sbatch_without_a_cluster(
     assert code == int(objects)
     assert (f"not checked by sbatch, which finds no cluster here: {words}" in told) != objects
     assert ("sbatch objects to" in told) == objects
+
+
+def test_a_check_says_what_of_the_environment_is_not_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    programs, venv = tmp_path / "bin", tmp_path / "venv"
+    for folder in (programs, venv / "bin"):
+        folder.mkdir(parents=True)
+    for name in ("sbatch", "shellcheck"):
+        (programs / name).symlink_to("/bin/true")
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+
+    def told(*words: str) -> str:
+        capsys.readouterr()
+        settings = [word for setting in words for word in ("--set", setting)]
+        assert command(monkeypatch, "slurm", "export", GRID, "--out", tmp_path / "out", "--check", *settings) == 0
+        return " ".join(capsys.readouterr().err.split())
+
+    asked = ("modules=[gcc, python/3.11]", f"venv={venv}")
+    said = told(*asked)
+    assert re.search(r"modules: `module load` of gcc, python/3\.11 fails here, .*module.*not found", said)
+    assert f"venv: {venv} has no bin/activate here" in said
+    assert "module load" not in told(*asked, "prologue=[source /etc/profile.d/modules.sh]")
+    (programs / "module").write_text('#!/bin/sh\n[ "$*" = "load gcc" ] || [ "$*" = "load python/3.11" ]\n')
+    (programs / "module").chmod(0o755)
+    (venv / "bin/activate").touch()
+    said = told(*asked)
+    assert ("modules:" in said, f"venv: {venv} has no bin/space-dist here" in said) == (False, True)
+    (venv / "bin/space-dist").touch()
+    assert "venv:" not in told(*asked)
+    assert "modules:" in told("modules=[gcc, python/3.12]")
 
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")

@@ -16,6 +16,7 @@ import typer
 
 from space_dist.cli.overview import (
     Watching,
+    counted,
     display,
     print_cells,
     print_failures,
@@ -109,19 +110,19 @@ def grid_plan(
         return
     print_cells(manifest, found)
     say(
-        f"{_of(len(manifest.cells), 'cell')} x {_of(len(manifest.seeds), 'seed')} = {_of(len(found), 'run')}, "
-        f"{made.steps:,} environment steps in whole updates; {_of(manifest.cpus_per_run, 'CPU')} a run"
+        f"{counted(len(manifest.cells), 'cell')} x {counted(len(manifest.seeds), 'seed')} = "
+        f"{counted(len(found), 'run')}, {made.steps:,} environment steps in whole updates; "
+        f"{counted(manifest.cpus_per_run, 'CPU')} a run"
         + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )
     other = sum(run_status.other_code for run_status in done)
-    say(f"done already: {len(done)} runs" + (f", {other} of them by another version of this package" if other else ""))
+    say(
+        f"done already: {counted(len(done), 'run')}"
+        + (f", {other} of them by another version of this package" if other else "")
+    )
     if made.dropped_runs:
         say(f"{made.dropped_runs} runs of the grid as it was frozen before are no longer in it; their folders are kept")
     say(f"frozen in {made.grid.folder}")
-
-
-def _of(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 @grid_app.command("run")
@@ -317,7 +318,8 @@ def grid_stop(
     for run_status in live:  # those nobody conducts any more, too
         run_status.ledger.stop_file.touch()
     were = "was" if len(live) == 1 else "were"
-    say(f"{manifest.name}: {_of(len(live), 'run')} {were} asked to make a checkpoint and end")
+    asked = f"{counted(len(live), 'run')} {were} asked to make a checkpoint and end"
+    say(f"{manifest.name}: {asked if live else 'asked to stop; no run is at work now'}")
     if queue and queue.live:
         say("SLURM jobs that still wait will end as soon as they start; scancel removes them")
 
@@ -348,7 +350,7 @@ def grid_retry(
             Attempts(run_status.ledger).forgive()
             say(f"{run_status.run.title}: {run_status.in_words}; it will be tried again")
             forgiven += 1
-    say(f"{_of(forgiven, 'run')} may be tried again{f'; {_how_again(grid, place, manifest)}' if forgiven else ''}")
+    say(f"{counted(forgiven, 'run')} may be tried again{f'; {_how_again(grid, place, manifest)}' if forgiven else ''}")
 
 
 def _how_again(named: Path, place: Grid, manifest: Manifest) -> str:

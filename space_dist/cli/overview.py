@@ -172,7 +172,7 @@ def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
                     run = run_status.run
                     say(f"  {run.title} ({run.cell.id}): {run_status.condition}{_why(run_status)}")
         for way, count in Counter(one.way_out for one in unwell if one.condition == "failed").items():
-            say(f"{count} {'run' if count == 1 else 'runs'} failed for good; {way}")
+            say(f"{counted(count, 'run')} failed for good; {way}")
         return
     for run_status in unwell[:_SHOWN_RUNS]:
         say(f"{run_status.run.title}: {run_status.in_words}{_why(run_status)}")
@@ -180,6 +180,11 @@ def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
         say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
     for way in dict.fromkeys(one.way_out for one in unwell if one.condition == "failed"):
         say(way)
+
+
+def counted(number: int, what: str) -> str:
+    """`1 run`, `2 runs`."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _why(run_status: RunStatus) -> str:

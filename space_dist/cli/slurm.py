@@ -22,7 +22,7 @@ from space_dist.cli.grids import (
     prepare,
     run_frozen,
 )
-from space_dist.cli.overview import tell
+from space_dist.cli.overview import counted, tell
 from space_dist.cli.terminal import STOP, one_of, say, warn
 from space_dist.cli.tuning import tell_outcome, tune_confirm
 from space_dist.errors import ConfigError, SpaceDistError
@@ -30,7 +30,7 @@ from space_dist.system.extras import needed_from
 
 if TYPE_CHECKING:
     from space_dist.experiment.manifest import Grid, Manifest
-    from space_dist.slurm import Mode
+    from space_dist.slurm import Mode, Profile
 
 slurm_app = typer.Typer(no_args_is_help=True, help="The same grid, or search, as SLURM scripts.")
 
@@ -70,7 +70,7 @@ def slurm_export(
     ] = None,
     cells_per_task: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(help="Runs that an array task does: pack short ones."),
+        typer.Option(help="Runs (a cell with one seed each, not cells) that an array task does: pack short ones."),
     ] = None,
     overrides: Annotated[
         Optional[list[str]],  # noqa: UP045
@@ -110,12 +110,18 @@ def slurm_export(
     made = Export(manifest, site, chosen, None if root is None else root.absolute())
     for path in export(made, instances, out, templates):
         say(str(path))
-    tasks = f"{made.n_tasks} array tasks" if mode == "array" else f"one job of {site.nodes} nodes"
+    tasks = (
+        f"{made.n_tasks} array task{'' if made.n_tasks == 1 else 's'}"
+        if mode == "array"
+        else f"one job of {counted(site.nodes, 'node')}"
+    )
     at_most = "" if manifest.search is None else "at most "
-    say(f"{manifest.name}: {at_most}{made.n_runs} runs in {tasks}; {out / 'README.md'} says what to do with it")
-    for remark in filter(None, (made.tracking_remark(out), made.import_remark())):
+    runs = counted(made.n_runs, "run")
+    say(f"{manifest.name}: {at_most}{runs} in {tasks}; {out / 'README.md'} says what to do with it")
+    for remark in filter(None, (made.tracking_remark(out), made.import_remark(), made.time_remark())):
         warn(f"warning: {remark}")
     if check:
+        _check_environment(site)
         _check(out, made.scripts)
 
 
@@ -268,6 +274,30 @@ def _bash() -> str:
     if found is None:
         raise SpaceDistError("there is no bash here")
     return found
+
+
+def _check_environment(site: Profile) -> None:
+    """Say what of a profile's modules and environment is not here: on nodes that lack it, too, jobs end at once."""
+    from space_dist.config import clean
+
+    if site.modules and not site.prologue:  # a line of which may be what brings the command `module`
+        try:
+            asked = subprocess.run(
+                [_bash(), "-c", 'for name; do module load "$name" || exit; done', "bash", *site.modules],
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_SECONDS, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise SpaceDistError(f"`module load` does not end within {_SECONDS:.0f} s") from None
+        if asked.returncode:
+            why = next(iter(asked.stderr.strip().splitlines()), "it says nothing")
+            warn(f"modules: `module load` of {', '.join(site.modules)} fails here, as it would in a job: {clean(why)}")
+    if site.venv is None:
+        return
+    needed = ["activate", *(["space-dist"] if site.command == ("space-dist",) and site.apptainer is None else [])]
+    for name in needed:
+        if not (Path(site.venv) / "bin" / name).is_file():
+            warn(f"venv: {site.venv} has no bin/{name} here, which jobs need on their nodes")
+            break
 
 
 def _check(folder: Path, scripts: tuple[str, str, str]) -> None:

@@ -27,7 +27,7 @@ from space_dist.errors import ConfigError, LedgerError, nearest
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.experiment.tuning import confirmation_of
 from space_dist.slurm.arrays import Array, arrays_of
-from space_dist.slurm.profile import Profile, variables_in
+from space_dist.slurm.profile import EARLY_SECONDS, Profile, seconds, variables_in
 from space_dist.system.files import atomic_write, read_file
 from space_dist.system.importing import found_in, lost_elsewhere
 
@@ -99,6 +99,17 @@ class Export:
             "grid's file, or MLFLOW_TRACKING_URI, to "
             f"http(s)://HOST:PORT or sqlite:///{results}/mlflow.db, and export again; or tracking.uri: null, and "
             "`space-dist sync` later"
+        )
+
+    def time_remark(self) -> str | None:
+        """What is to be known of a time limit that SLURM may announce as soon as a job begins."""
+        limit, lead = seconds(self.profile.time), self.profile.signal.lead_seconds
+        if limit is None or limit > lead + EARLY_SECONDS:
+            return None
+        return (
+            f"time: {limit} s, of which SLURM announces the end {lead} s before (signal.lead_seconds), or up to "
+            f"{EARLY_SECONDS} s sooner: jobs may make a checkpoint and go back into the queue as soon as they begin, "
+            f"until max_requeues. A time above {lead + EARLY_SECONDS} s leaves some for training"
         )
 
     @property

@@ -19,6 +19,7 @@ from space_dist.errors import nearest
 _MAX_WORD, _MAX_LINE, _MAX_ITEMS = 200, 1000, 50  # sbatch reads a directive into 8 KiB
 _EXTRA = re.compile(r"--([a-z][a-z0-9-]{0,40})(=.*)?")
 _TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<rest>\d+(?::\d+){0,2})")
+EARLY_SECONDS = 60  # by which SLURM may send a signal before it is due (sbatch(1), --signal)
 _MEMORY = r"^[0-9]{1,12}[KMGT]?$"
 _NAME = r"[A-Za-z_][A-Za-z0-9_]*"
 _VARIABLE = re.compile(_NAME)
@@ -144,8 +145,8 @@ class Profile(Section):
     throttle: int | None = Field(default=None, ge=1, le=1_000_000)
     """Array tasks at a time; in cluster mode: runs at a time. null: as many as there is room for."""
     cells_per_task: int = Field(default=1, ge=1, le=100_000)
-    """Runs that an array task does, one after another, or at once if it has the CPUs. More than 1 suits runs that
-    are short beside the half minute it takes to start."""
+    """Runs (not cells: a cell has one for each seed) that an array task does, one after another, or at once if it has
+    the CPUs. More than 1 suits runs that are short beside the half minute it takes to start."""
     max_array_size: int = Field(default=1001, ge=2, le=4_000_001)
     """The site's MaxArraySize (`scontrol show config`). More tasks are written as several arrays."""
     output: Text = "logs/%x-%A_%a.out"
@@ -260,7 +261,10 @@ class Profile(Section):
             raise ValueError("venv and conda exclude each other")
         limit = seconds(self.time)
         if limit is not None and limit <= self.signal.lead_seconds:
-            raise ValueError(f"time ({limit} s) must be longer than signal.lead_seconds ({self.signal.lead_seconds} s)")
+            raise ValueError(
+                f"time ({limit} s) must be longer than signal.lead_seconds ({self.signal.lead_seconds} s): else each "
+                "job makes a checkpoint and goes back into the queue as soon as it begins"
+            )
         return self
 
 
