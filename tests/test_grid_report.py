@@ -116,6 +116,12 @@ def written(grid: Grid) -> Path:
     return build_grid_report(grid).folder
 
 
+def test_a_grid_of_one_run_is_spoken_of_as_one(tmp_path: Path) -> None:
+    grid = make_grid(tmp_path / "grid", POINTS[:1], n_seeds=1)
+    finish(grid, 0, 0, 1.0)
+    assert build_grid_report(grid).summary[0] == "Its one run is finished (1 cell × 1 seed)."
+
+
 def test_every_number_says_how_many_seeds_it_rests_on(grid: Grid, written: Path) -> None:
     assert written == grid.folder / "report"
     text = (written / "report.md").read_text()

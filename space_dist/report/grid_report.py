@@ -253,8 +253,9 @@ def _summary(
             f"No run of this grid has finished yet, so there is no number to report: of its {n_runs:,} runs ({size}), "
             f"{rest}."
         ]
-    every = "All" if done == n_runs else f"{done:,} of"
-    sentences = [f"{every} {n_runs:,} runs are finished ({size}){f'; {rest}' if rest else ''}."]
+    every = f"All {n_runs:,}" if done == n_runs else f"{done:,} of {n_runs:,}"
+    finished = "Its one run is finished" if n_runs == 1 else f"{every} runs are finished"
+    sentences = [f"{finished} ({size}){f'; {rest}' if rest else ''}."]
     if manifest.scale != scaling.WHOLE:
         sentences.append(
             f"A grid in small, {scaling.in_words(manifest.scale, len(manifest.seeds))}: no evidence for the whole one."
