@@ -299,6 +299,24 @@ def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
     assert same(folder, finished)
 
 
+def test_a_file_stop_is_heard_from_the_start_of_the_process_on_and_an_older_one_is_told(
+    finished: Path, tmp_path: Path
+) -> None:
+    folder, stop = tmp_path / "run", tmp_path / "run/stop"
+    folder.mkdir()
+    process = prepared.command([*train(out=folder), "--resume"], tmp_path / "said")
+    stop.touch()  # while it starts
+    code, said = ended(process, tmp_path / "said")
+    assert (code, stop.exists()) == (75, False), said
+    assert f"stopped by the file {stop}" in said
+    stop.touch()
+    os.utime(stop, (1e9, 1e9))
+    code, said = ended(prepared.command([*train(out=folder), "--resume"], tmp_path / "said"), tmp_path / "said")
+    assert (code, stop.exists()) == (0, False)
+    assert f"{stop} is from before this began" in said
+    assert same(folder, finished)
+
+
 def test_a_second_process_on_the_same_run_refuses(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = tmp_path / "run"
     first = prepared.command(train("budget.steps=10000000", out=folder), tmp_path / "said")

@@ -23,6 +23,7 @@ from space_dist.slurm import Export, export
 from space_dist.slurm.export import AGGREGATE, JOBS, SUBMIT, TRAIN
 from space_dist.slurm.node import address_facing
 from space_dist.slurm.queue import queue_of
+from space_dist.system.interrupts import StopRequests
 from tests.commanding import command
 from tests.patience import PATIENCE
 from tests.test_slurm import GRID, Stubs, grid, manifest, profile, short, stubs, write  # noqa: F401
@@ -75,8 +76,22 @@ def test_a_task_obeys_the_users_stop_and_only_the_whole_grid_ends_it(
         task.conduct()
     assert place.stop_file.exists()
     quiet = dataclasses.replace(manifest, tracking=manifest.tracking.model_copy(update={"uri": None}))
-    with working_on(place, quiet, wait=False, stop_requested=lambda: None, say=print):
+    said: list[str] = []
+    time.sleep(0.1)  # more than a tick of the clock that files have
+    with working_on(place, quiet, wait=False, stop=StopRequests(), say=said.append):
         assert not place.stop_file.exists()
+    assert "is from before this began" in said[0]
+
+
+def test_who_asks_a_grid_to_stop_while_it_starts_is_heard(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
+    place = adopt(grid, tmp_path)
+    quiet = dataclasses.replace(manifest, tracking=manifest.tracking.model_copy(update={"uri": None}))
+    stop = StopRequests()
+    place.stop_file.touch()
+    with working_on(place, quiet, wait=False, stop=stop, say=print):
+        conductor = Conductor(place, manifest, manifest.runs()[:1], Idle(), stop_requested=stop.reason)
+        with pytest.raises(Interrupted, match="the grid's file `stop`"):
+            conductor.conduct()
 
 
 def test_tasks_may_freeze_their_grid_all_at_once(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:

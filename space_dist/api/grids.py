@@ -101,7 +101,7 @@ def run_grid(
                 progress(overview)
             show(line_of_grid(manifest.name, overview))
 
-        with working_on(place, manifest, wait=True, stop_requested=stop.reason, say=show):
+        with working_on(place, manifest, wait=True, stop=stop, say=show):
             worked_through(
                 place, manifest, manifest.runs(), max_parallel=max_parallel, server=server, stop=stop, observe=observe
             )  # fmt: skip

@@ -140,6 +140,7 @@ def train(
     the run's folder asked for that; SpaceDistError if it failed. After KeyboardInterrupt, `resume=True` goes on from
     the last checkpoint.
     """
+    stop = StopRequests()
     run = as_config(config, overrides, seed=seed, workers=workers)
     folder = default_folder(run.name, run.seed) if out is None else lasting(Path(out), "out")
     source = str(config) if isinstance(config, str | Path) else _SOURCE
@@ -153,7 +154,7 @@ def train(
         def waiting(what: str) -> None:
             show(f"{run.name} s{run.seed}  {what}")
 
-        outcome = launch(run, folder, resume=resume, stop=StopRequests(), observe=observe, waiting=waiting)
+        outcome = launch(run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting)
     return Run(outcome.ledger.folder, tracking_warning=outcome.tracking_warning)
 
 

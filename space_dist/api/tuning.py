@@ -55,7 +55,7 @@ def run_search(
 
             yield observe
 
-        with working_on(place, place.manifest(), wait=True, stop_requested=stop.reason, say=show):
+        with working_on(place, place.manifest(), wait=True, stop=stop, say=show):
             searched_through(place, observing=observing, stop=stop, max_parallel=max_parallel, server=server)
     return GridRun(place.folder)
 

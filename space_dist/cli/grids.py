@@ -432,7 +432,7 @@ def run_frozen(
     log_to(place)
     with contextlib.ExitStack() as stack:
         if part is None:
-            stack.enter_context(working_on(place, manifest, wait=True, stop_requested=STOP.reason, say=warn))
+            stack.enter_context(working_on(place, manifest, wait=True, stop=STOP, say=warn))
         observe = stack.enter_context(display(manifest, place))
         return worked_through(
             place, manifest, chosen, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,

@@ -106,7 +106,7 @@ def tune_run(
 
         place = planned(tune, root_of(root))
         log_to(place)
-        with working_on(place, place.manifest(), wait=True, stop_requested=STOP.reason, say=warn):
+        with working_on(place, place.manifest(), wait=True, stop=STOP, say=warn):
             manifest = searched_through(
                 place, observing=lambda manifest: display(manifest, place), stop=STOP, address=address, mode=chosen,
                 max_parallel=max_parallel, nodes=nodes, server=server, reinstall=STOP.install, say=say,

@@ -35,6 +35,7 @@ from space_dist.experiment.status import (
 )
 from space_dist.ledger import Lock
 from space_dist.system.files import in_words, locked
+from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import code_digest
 from space_dist.tracking.pusher import LOOK_AT, Pusher
 
@@ -348,7 +349,7 @@ class Conductor:
 
 @contextlib.contextmanager
 def working_on(
-    grid: Grid, manifest: Manifest, *, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
+    grid: Grid, manifest: Manifest, *, wait: bool, stop: StopRequests, say: Callable[[str], None]
 ) -> Iterator[None]:
     """Be the only one who works on the grid, once whoever does so now is gone, and keep MLflow's mirror meanwhile.
 
@@ -358,8 +359,12 @@ def working_on(
     """
     pusher = None
     try:
-        with owning(grid, wait=wait, stop_requested=stop_requested, say=say):
-            grid.stop_file.unlink(missing_ok=True)  # whoever works on the whole grid means it
+        with owning(grid, wait=wait, stop_requested=stop.reason, say=say) as waited:
+            # Whoever works on the whole grid means it, but for who asks this process.
+            if waited and grid.stop_file.exists():  # it asked whom this one waited for
+                grid.stop_file.unlink(missing_ok=True)
+            elif stop.sweep(grid.stop_file):
+                say(f"{grid.stop_file} is from before this began: it asked somebody else, and was removed")
             if manifest.tracking.anywhere:
                 pusher = Pusher(manifest.tracking, grid.folder, grid.tracking_log)
             yield
@@ -374,18 +379,21 @@ def working_on(
 @contextlib.contextmanager
 def owning(
     grid: Grid, *, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
-) -> Iterator[None]:
-    """Be the only one who may change the grid's folder, once whoever does so now is gone. Raises as `working_on`."""
-    lock = _acquired(grid, wait, stop_requested, say)
+) -> Iterator[bool]:
+    """Be the only one who may change the grid's folder, once whoever does so now is gone. Raises as `working_on`.
+
+    Yields whether there was anybody to wait for.
+    """
+    lock, waited = _acquired(grid, wait, stop_requested, say)
     try:
-        yield
+        yield waited
     finally:
         lock.release()
 
 
 def _acquired(
     grid: Grid, wait: bool, stop_requested: Callable[[], str | None], say: Callable[[str], None]
-) -> Lock:  # fmt: skip
+) -> tuple[Lock, bool]:  # fmt: skip
     lock, said = Lock(grid.lock_file), False
     while True:
         try:
@@ -402,4 +410,4 @@ def _acquired(
         except OSError as error:
             raise LedgerError(f"cannot write the grid's folder {grid.folder}: {in_words(error)}") from None
         else:
-            return lock
+            return lock, said

@@ -205,7 +205,7 @@ def _begun(
             "out=DIR)"
         )
     with RunWriter(ledger) as writer:
-        status = _claim(blueprint, setup, writer, pause_at)
+        status = _claim(blueprint, setup, writer, stop, pause_at)
         done = Outcome(ledger, already_done=status.has_reached(pause_at))
         active = ActiveRun(blueprint, setup, writer, status, stop, done, pause_at=pause_at)
         if active.outcome.already_done:
@@ -229,14 +229,14 @@ def _begun(
 
 def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
     """Stop before the first round. Raises Interrupted; what was committed by then is all there is."""
-    reason = stop.signalled  # the file was removed as the run began
+    reason = stop.signalled or stop.filed
     if reason is not None and writer.status is not None:
         message = f"stopped by {reason} before its first round; --resume continues"
         writer.set_status(replace(writer.status, state="interrupted", message=reason, updated_at=time.time()))
         raise Interrupted(message)
 
 
-def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int) -> Status:
+def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequests, pause_at: int) -> Status:
     """Make the folder this run's, or recognise it as such; returns where the run stands now."""
     config, ledger = blueprint.config, writer.ledger
     given = blueprint.given
@@ -287,8 +287,8 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, pause_at: int)
         log.info("going on under %s, from round %d", what, status.round)
     # Before the status, which names the digests of these files.
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), given)
-    # It asked the process before this one.
-    ledger.stop_file.unlink(missing_ok=True)
+    if stop.sweep(ledger.stop_file):
+        log.warning("%s is from before this began: it asked somebody else, and was removed", ledger.stop_file)
     writer.set_status(status)
     return status
 
@@ -499,6 +499,8 @@ def _failures_noted(writer: RunWriter) -> Iterator[None]:
             yield
     except Interrupted as error:
         log.warning("%s", error)
+        with contextlib.suppress(OSError):
+            writer.ledger.stop_file.unlink(missing_ok=True)  # it asked us, and must not ask who goes on
         raise
     except RunLockedError as error:
         log.error("%s", error)  # the status now belongs to somebody else

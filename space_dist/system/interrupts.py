@@ -6,21 +6,35 @@ import atexit
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Final
 
 from space_dist.errors import Interrupted
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+_COARSE_SECONDS: Final = 1.0  # between two times of a file, where they are whole seconds
+_FINE_SECONDS: Final = 0.05  # elsewhere: the kernel's clock for files goes by ticks
 
 
 def _settle() -> None:
     """Once the exit code is decided, Python takes its handlers down: what came then would end the process its way."""
     for number in (signal.SIGTERM, signal.SIGUSR1):  # and not SIGINT, should the end hang
         signal.signal(number, signal.SIG_IGN)
+
+
+def _process_start() -> float:
+    """When this process was started, as Unix time, to some hundredths of a second; now, where that is not known."""
+    try:
+        # Field 22, in ticks since the machine's start: the names before it may hold spaces.
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError, AttributeError):
+        age = 0.0
+    return time.time() - max(0.0, age)
 
 
 class StopRequests:
@@ -40,11 +54,12 @@ class StopRequests:
         self._file: Path | None = None
         self._grace_seconds = 25.0
         self._installed = False
+        self._since = time.time()
 
     def install(self) -> None:
-        """Set the handlers."""
+        """Set the handlers, of a process that is there for what may be stopped: it is heard from its start on."""
         if not self._installed:
-            self._installed = True
+            self._installed, self._since = True, _process_start()
             atexit.register(_settle)  # before anybody else's, so it comes last
         for number in STOP_SIGNALS:
             signal.signal(number, self._on_signal)
@@ -74,17 +89,35 @@ class StopRequests:
         if self._shared is not None:
             self._shared._grace_seconds = grace_seconds
 
+    def sweep(self, stop_file: Path) -> bool:
+        """Remove a `stop_file` that is older than this, and so asked somebody before; whether there was one."""
+        since = self._since if self._shared is None else self._shared._since
+        try:
+            written = stop_file.stat()
+        except FileNotFoundError:
+            return False
+        whole = written.st_mtime_ns % 1_000_000_000 == 0
+        if written.st_mtime > since - (_COARSE_SECONDS if whole else _FINE_SECONDS):
+            return False
+        stop_file.unlink(missing_ok=True)
+        return True
+
     @property
     def signalled(self) -> str | None:
         """The signal that asked to stop, if one did."""
         return self._reason if self._shared is None else self._shared.signalled
 
+    @property
+    def filed(self) -> str | None:
+        """The file that asks to stop, if it is there."""
+        return f"the file {self._file}" if self._file is not None and self._file.exists() else None
+
     def reason(self) -> str | None:
         """Why to stop, or None."""
         if self._shared is not None and self._reason is None:
             self._reason = self._shared.signalled
-        if self._reason is None and self._file is not None and self._file.exists():
-            self._reason = f"the file {self._file}"
+        if self._reason is None:
+            self._reason = self.filed
         return self._reason
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - the signature is Python's
