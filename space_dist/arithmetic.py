@@ -114,6 +114,11 @@ def overruled() -> list[str]:
     ]
 
 
+def imported_before() -> str:
+    """What had been imported before this package, too late for its settings; empty if there was nothing."""
+    return " and ".join(_late)
+
+
 def remarks(found: str) -> list[str]:
     """Sentences about this process's arithmetic, whose `digest` of everything is `found`: for the log of a run."""
     if chosen() == "native":
@@ -126,7 +131,7 @@ def remarks(found: str) -> list[str]:
     if not has_reference_cpu():
         reason = f"this is no x86-64 CPU with AVX2 and FMA ({platform.machine()})"
     elif _late:
-        reason = f"{' and '.join(_late)} had been imported before space_dist"
+        reason = f"{imported_before()} had been imported before space_dist"
     else:
         reason = "the libraries, or the system's libm, are other versions than those of constraints.txt and Debian 12"
     return [

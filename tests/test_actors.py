@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.arithmetic import digest, scipy_checks
 from space_dist.errors import SpaceDistError
@@ -120,6 +121,9 @@ def test_actors_are_compared_by_all_that_they_compute_with(
         for part in parts:
             with pytest.raises(SpaceDistError, match=rf"computes other bits than this process with {part} \(0 there"):
                 ray_actors.refuse_other_arithmetic(0, {**found, part: "0"})
+    monkeypatch.setattr(arithmetic, "_late", ["numpy", "torch"])
+    with pytest.raises(SpaceDistError, match=r"here numpy and torch had been imported before .* restart the kernel"):
+        ray_actors.refuse_other_arithmetic(0, {"numpy": "0"})
     monkeypatch.setattr(ray_actors, "scipy_checks", lambda: iter([("qr", np.zeros(1))]))
     assert ray_actors.computed(["scipy"]) != {"scipy": digest(scipy_checks())}
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from space_dist.arithmetic import digest, numpy_digest, scipy_checks
+from space_dist.arithmetic import digest, imported_before, numpy_digest, scipy_checks
 from space_dist.config import RunConfig
 from space_dist.envs import BULLET_IDS
 from space_dist.errors import SpaceDistError, exits_refused
@@ -109,9 +109,16 @@ def refuse_other_arithmetic(index: int, found: Mapping[str, str]) -> None:
     """Raise SpaceDistError for an actor whose results, `found` by part, would depend on its being there."""
     here = computed(found)
     other = [f"{part} ({theirs} there, {here[part]} here)" for part, theirs in found.items() if theirs != here[part]]
-    if other:
+    if not other:
+        return
+    what = f"{name_of(index)} computes other bits than this process with {', '.join(other)}"
+    if early := imported_before():
         raise SpaceDistError(
-            f"{name_of(index)} computes other bits than this process with {', '.join(other)}: its node has another "
-            "kind of CPU, or other library versions, and results would depend on who computes what. Keep the run to "
-            "nodes of one kind (resources.address, or the cluster's own constraints)"
+            f"{what}: here {early} had been imported before space_dist, too late for the settings that make results "
+            "the same on every CPU, and results would depend on who computes what. Start this process anew (of a "
+            "notebook, restart the kernel) and import space_dist first"
         )
+    raise SpaceDistError(
+        f"{what}: its node has another kind of CPU, or other library versions, and results would depend on who "
+        "computes what. Keep the run to nodes of one kind (resources.address, or the cluster's own constraints)"
+    )
