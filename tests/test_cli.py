@@ -245,6 +245,19 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_run_that_ends_by_its_episodes_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    config = ROOT / "configs/cartpole_dqn_space.yaml"
+    settings = ("budget.episodes=4", "evaluation.episodes=1", "tracking.uri=null", "resources.workers=0")
+    sets = [part for setting in settings for part in ("--set", setting)]
+    code, out, _ = run(capsys, "train", config, "--out", tmp_path / "run", *sets)
+    steps = Ledger(tmp_path / "run").status().steps
+    *_, last, ended = out.splitlines()
+    assert code == 0
+    assert f"{steps:,}/20,000 steps, 4/4 episodes" in last
+    assert f"done, 4 of 4 episodes, {steps:,} environment steps" in ended
+    assert "budget of 20000 environment steps, or of 4 episodes" in (tmp_path / "run/log.txt").read_text()
+
+
 def same(one: Path, other: Path) -> bool:
     return all((one / name).read_bytes() == (other / name).read_bytes() for name in (METRICS, CURRICULUM, "model.npz"))
 

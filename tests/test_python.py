@@ -384,3 +384,12 @@ def test_a_rate_that_cannot_be_told_yet_is_a_dash() -> None:
     assert "  —/s  set 4/100" in progress.line_of_run(
         "pointmass_space", 0, dataclasses.replace(known, steps_per_second=0.0)
     )
+
+
+def test_how_far_a_run_is_goes_by_the_limit_that_is_nearer() -> None:
+    known = Progress(1000, 60_000, 500.0, 1, 3, episodes=25, budget_episodes=100)
+    assert "  1,000/60,000 steps, 25/100 episodes (25%)" in progress.line_of_run("cartpole", 0, known)
+    assert known.seconds_left == pytest.approx(3 * 1000 / 500)
+    assert dataclasses.replace(known, episodes=102).seconds_left is None
+    by_steps = dataclasses.replace(known, steps=30_000)
+    assert (by_steps.share, by_steps.seconds_left) == (0.5, pytest.approx(60.0))

@@ -100,9 +100,8 @@ def shown(wanted: bool) -> Iterator[Callable[[str], None]]:
 
 def line_of_run(name: str, seed: int, progress: Progress) -> str:
     """`pointmass_space s0  12,288/100,000 steps (12 %)  5,012/s  set 4/100  return train 1.20 test 1.10`."""
-    share = progress.steps / max(1, progress.budget_steps)
     return (
-        f"{name} s{seed}  {progress.steps:,}/{progress.budget_steps:,} steps ({share:.0%})  "
+        f"{name} s{seed}  {progress.so_far} ({progress.share:.0%})  "
         f"{progress.pace}  set {progress.trained}  "
         f"return train {_number(progress.train_return)} test {_number(progress.test_return)}"
     )

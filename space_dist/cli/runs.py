@@ -55,10 +55,19 @@ def train(
     changes = [*(overrides or ()), *settings]
     run = configs.load(config, changes)
     folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
+    episodes = 0
+
+    def observed(progress: Progress) -> None:
+        nonlocal episodes
+        episodes = progress.episodes
+        observe(progress)
+
     with about(str(config), configs.origins(changes)), _display(run.name, run.seed) as (observe, waiting):
-        outcome = launch(run, folder, resume=resume, stop=STOP, observe=observe, waiting=waiting)
+        outcome = launch(run, folder, resume=resume, stop=STOP, observe=observed, waiting=waiting)
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
+    if run.budget.episodes is not None and episodes:
+        verb += f", {episodes:,} of {run.budget.episodes:,} episodes"
     say(f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}")
     _name_pages(outcome.pages)
     if outcome.tracking_warning:
@@ -366,7 +375,7 @@ def _display(name: str, seed: int) -> Iterator[tuple[Callable[[Progress], None],
         task = bar.add_task(f"{name} s{seed}", total=None, line="reading instances and environment")
 
         def observe(progress: Progress) -> None:
-            bar.update(task, completed=progress.steps, total=progress.budget_steps, line=_in_words(progress))
+            bar.update(task, completed=progress.share, total=1.0, line=_in_words(progress))
 
         yield observe, lambda what: bar.update(task, line=what)
 
@@ -378,11 +387,10 @@ def _lines(title: str) -> tuple[Callable[[Progress], None], Callable[[str], None
     def observe(progress: Progress) -> None:
         nonlocal said_at
         now = time.monotonic()
-        if now - said_at < _LINE_SECONDS and progress.steps < progress.budget_steps:
+        if now - said_at < _LINE_SECONDS and progress.share < 1:
             return
-        said_at = now
-        rate, left = progress.steps_per_second, progress.budget_steps - progress.steps
-        remaining = f"  {datetime.timedelta(seconds=round(left / rate))} left" if rate > 0 and left > 0 else ""
+        said_at, left = now, progress.seconds_left
+        remaining = "" if left is None else f"  {datetime.timedelta(seconds=round(left))} left"
         say(f"{title}: {_in_words(progress)}{remaining}")
 
     return observe, lambda what: say(f"{title}: {what}")
@@ -393,7 +401,7 @@ def _in_words(progress: Progress) -> str:
         return "—" if value is None else f"{value:.2f}"
 
     return (
-        f"{progress.steps:,}/{progress.budget_steps:,} steps  {progress.pace}  "
+        f"{progress.so_far}  {progress.pace}  "
         f"set {progress.trained}  "
         f"return train {number(progress.train_return)} test {number(progress.test_return)}"
     )

@@ -222,7 +222,9 @@ def _begun(
                 )
             for remark in arithmetic.remarks(status.fingerprint["arithmetic"]):
                 log.warning("%s", remark)
-            log.info("seed %d, budget of %d environment steps", status.seed, status.budget_steps)
+            episodes = blueprint.config.budget.episodes
+            limit = "" if episodes is None else f", or of {episodes} episodes, whichever ends first"
+            log.info("seed %d, budget of %d environment steps%s", status.seed, status.budget_steps, limit)
             active.raise_if_stopped()  # before Ray is started
             yield active
 

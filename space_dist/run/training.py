@@ -70,7 +70,8 @@ class Progress:
     """What a display shows, and a function that is given as `progress` is called with.
 
     steps, budget_steps: environment steps.  set_size: how many of `n_instances` are selected.  train_return,
-    test_return: means of the last evaluation; None before the first.
+    test_return: means of the last evaluation; None before the first.  episodes, budget_episodes: of training; None
+    where they are not limited.
     """
 
     steps: int
@@ -80,6 +81,27 @@ class Progress:
     n_instances: int
     train_return: float | None = None
     test_return: float | None = None
+    episodes: int = 0
+    budget_episodes: int | None = None
+
+    @property
+    def share(self) -> float:
+        """How much is done, from 0 to 1, by the limit that is nearer: steps or episodes."""
+        by_steps = self.steps / max(1, self.budget_steps)
+        return min(1.0, max(by_steps, self.episodes / self.budget_episodes if self.budget_episodes else 0.0))
+
+    @property
+    def seconds_left(self) -> float | None:
+        """At its pace, to the limit that is nearer; None where it is there, or that cannot be told."""
+        if not (self.steps and self.steps_per_second > 0 and self.share < 1):
+            return None
+        return self.steps * (1 / self.share - 1) / self.steps_per_second
+
+    @property
+    def so_far(self) -> str:
+        """`4,108/20,000 steps`, and `, 40/100 episodes` where these are limited, too."""
+        episodes = f", {self.episodes:,}/{self.budget_episodes:,} episodes" if self.budget_episodes else ""
+        return f"{self.steps:,}/{self.budget_steps:,} steps{episodes}"
 
     @property
     def trained(self) -> str:
@@ -149,7 +171,9 @@ class Training:
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
         self._last_commit_round, self._commit_cost = 0, 0.0  # seconds, that the last one took to write
-        self.progress = Progress(0, self._total_steps, 0.0, 0, len(setup.train))
+        self.progress = Progress(
+            0, self._total_steps, 0.0, 0, len(setup.train), budget_episodes=self._config.budget.episodes
+        )
 
     def run(self) -> None:
         """Train to the end of the budget, or as far as asked. Raises Interrupted, after a commit, if asked to stop."""
@@ -607,5 +631,5 @@ class Training:
         self._adopt(cluster.begin(cluster.start_values(policy)))
 
     def _show(self) -> None:
-        self.progress.steps = self._run.steps
+        self.progress.steps, self.progress.episodes = self._run.steps, self._run.episodes
         self._observe(self.progress)
