@@ -150,7 +150,7 @@ def test_the_pages_on_a_cluster(place: Place, monkeypatch: pytest.MonkeyPatch) -
     assert [grid.ledger(run).status_file.read_bytes() for run in runs] == before  # nothing ran twice
     assert Ledger(place.shared / "runs/pointmass_space/s0").status().state == "done"
     shell.block("ray.md", 4, {"--workers 4": "--workers 1"})
-    assert Ledger(shell.folder / "runs/cartpole_dqn_space/s0").status().state == "done"
+    assert Ledger(shell.folder / "runs/cartpole_space/s0").status().state == "done"
     shell.block("grids.md", 2, {
         "[--watch] [--json] [--by-cause]": "--watch --json --by-cause", "[--follow]": "--follow",
         "GRID": "runs/pointmass_small", "'CELL' --seed 3 ": "'space kappa=16' --seed 0 ",
