@@ -154,7 +154,7 @@ def train(
         def waiting(what: str) -> None:
             show(f"{run.name} s{run.seed}  {what}")
 
-        outcome = launch(run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting)
+        outcome = launch(run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting, tell=waiting)
     return Run(outcome.ledger.folder, tracking_warning=outcome.tracking_warning)
 
 

@@ -63,7 +63,10 @@ def train(
         observe(progress)
 
     with about(str(config), configs.origins(changes)), _display(run.name, run.seed) as (observe, waiting):
-        outcome = launch(run, folder, resume=resume, stop=STOP, observe=observed, waiting=waiting)
+        outcome = launch(
+            run, folder, resume=resume, stop=STOP, observe=observed, waiting=waiting,
+            tell=lambda sentence: warn(f"space-dist: {sentence}"),
+        )  # fmt: skip
     status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
     if run.budget.episodes is not None and episodes:

@@ -75,12 +75,13 @@ def launch(
     pause_at: int = 0,
     observe: Callable[[Progress], None] = lambda progress: None,
     waiting: Callable[[str], None] = lambda what: None,
+    tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Run `config` in `folder` to its end, or go on where it stopped.
 
     pause_at: environment steps at which it is paused, behind the first update that is made then, to be gone on with by
     another launch; 0: nowhere. observe: told of progress. waiting: told what is waited for, before and behind that:
-    `starting Ray`.
+    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
@@ -88,7 +89,7 @@ def launch(
     """
     with begun(config, folder, resume=resume, stop=stop, pause_at=pause_at) as active:
         for part in active.parts():
-            with _cluster(part, waiting) as cluster:
+            with _cluster(part, waiting, tell) as cluster:
                 waiting("preparing the learner")
                 part.training(cluster, observe).run()
     # The lock is free by now: a server that hangs keeps nobody from the run.
@@ -470,15 +471,33 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
     return Blueprint(stored_config(ledger), spec).policy_in(checkpoint)
 
 
+def _in_number(count: int, what: str) -> str:
+    """`1 shard`, `2 shards`."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 @contextlib.contextmanager
-def _cluster(active: ActiveRun, waiting: Callable[[str], None]) -> Iterator[Cluster]:
+def _cluster(
+    active: ActiveRun, waiting: Callable[[str], None], tell: Callable[[str], None]
+) -> Iterator[Cluster]:  # fmt: skip
     config = active.blueprint.config
     workers = n_workers(config, active.blueprint.spec)
     if workers == 0:
         with contextlib.closing(InProcess(config, active.setup)) as here:
             yield here
         return
-    actors = f"{workers} rollout actor{'s' if workers > 1 else ''}"
+
+    def told(sentence: str) -> None:
+        log.warning("%s", sentence)
+        tell(sentence)
+
+    shards = active.blueprint.config.rollout.shards
+    if workers > shards:
+        told(
+            f"resources.workers: {workers}: a round has {_in_number(shards, 'shard')} (rollout.shards), so more than "
+            f"{_in_number(shards, 'actor')} take CPUs and gain nothing"
+        )
+    actors = _in_number(workers, "rollout actor")
     if config.resources.address == "local":
         waiting(f"starting Ray with {actors}")
         private_ray()
@@ -489,7 +508,7 @@ def _cluster(active: ActiveRun, waiting: Callable[[str], None]) -> Iterator[Clus
 
     with contextlib.ExitStack() as stack:
         with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(config, active.setup, active.raise_if_stopped, active.note))
+            cluster = stack.enter_context(RayCluster(config, active.setup, active.raise_if_stopped, active.note, told))
         yield cluster
 
 

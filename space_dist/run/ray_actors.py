@@ -6,6 +6,7 @@ Imports neither Ray, which makes actors of these classes, nor torch, unless the 
 from __future__ import annotations
 
 import importlib.metadata
+import platform
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -29,6 +30,10 @@ class _Timed:
     def ready(self, parts: Sequence[str]) -> dict[str, str]:
         """Answers once the actor is up: with what its arithmetic computes, as `computed` says."""
         return computed(parts)
+
+    def host(self) -> str:
+        """The name of its machine."""
+        return platform.node()
 
     def timed(self, method: str, several: bool, *arguments: Any, **options: Any) -> tuple[Any, ...]:
         """Seconds, and the answer: one object, or each of `several`."""

@@ -104,16 +104,19 @@ class RayCluster:
     """
 
     def __init__(
-        self, config: RunConfig, setup: Setup, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
-    ) -> None:
-        """As `join_ray` for `raise_if_stopped` and `note`."""
+        self, config: RunConfig, setup: Setup, raise_if_stopped: Callable[[], None] = lambda: None,
+        note: Note = nowhere, tell: Callable[[str], None] = log.warning,
+    ) -> None:  # fmt: skip
+        """As `join_ray` for `raise_if_stopped` and `note`. tell: hears of what is lost, and puts it into the log."""
         self._config, self._resources, self._setup = config, config.resources, setup
         self._workers = max(1, n_workers(config, setup.spec))
-        self._raise_if_stopped, self._note = raise_if_stopped, note
+        self._raise_if_stopped, self._note, self._tell = raise_if_stopped, note, tell
         self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by index
         self._starting: dict[int, tuple[Any, float]] = {}  # index -> its sign of life to be, and since when
+        self._hosts: dict[int, str] = {}  # index -> the machine it is on, as long as it is up
+        self._asked_hosts: dict[int, Any] = {}  # index -> that answer to be, which comes before the sign of life
         self._failed_starts: dict[int, int] = defaultdict(int)
         self._unanswered: list[_Call] = []
         self._submitted = 0
@@ -264,8 +267,18 @@ class RayCluster:
                             dead.add(call.actor_index)
             late = self._late()
             if dead or lost or late:
+                self._tell_lost(dead)
                 self._replace(dead | late)
                 self._ask_again(dead | late, lost, reason)
+
+    def _tell_lost(self, dead: Iterable[int]) -> None:
+        """A line for each machine on which actors have died."""
+        on: dict[str, list[str]] = defaultdict(list)
+        for index in sorted(dead):
+            on[self._hosts.get(index, "a node")].append(name_of(index))
+        for host, names in on.items():
+            new = "a new one takes its place" if len(names) == 1 else "new ones take their places"
+            self._tell(f"lost {', '.join(names)} (on {host}); what was owed is computed again, and {new}")
 
     def _makers(self, call: _Call) -> set[_Call]:
         """The answered calls whose answers were this one's arguments."""
@@ -350,6 +363,7 @@ class RayCluster:
                 else ray.remote(num_cpus=1, **options)(RolloutActor).remote(setup, folders_of_user())
             )
             parts = self._computing[index == CENTRAL]
+            self._asked_hosts[index] = self._actors[index].host.remote()
             self._starting[index] = (self._actors[index].ready.remote(parts), time.monotonic())
 
     def _close_environments(self) -> None:
@@ -375,7 +389,7 @@ class RayCluster:
         for index, (ref, since) in list(self._starting.items()):
             if ref in arrived:
                 try:
-                    found = ray.get(ref)
+                    found, self._hosts[index] = ray.get([ref, self._asked_hosts[index]])
                 except RayError as error:
                     self._retry_start(index, error)
                 else:
@@ -434,7 +448,7 @@ class RayCluster:
                     if waited > seconds:
                         raise self._no_room(workers)
                     continue
-                log.warning("room is left for %d of %d rollout actors", workers, self._workers)
+                self._tell(f"room is left for {workers} of {self._workers} rollout actors")
                 self._start((*range(workers), CENTRAL))
 
     def _has_room(self) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import platform
+import re
 import shutil
 import signal
 import time
@@ -165,5 +167,9 @@ def test_a_lost_node_is_survived_with_what_is_left(
     config = with_resources(short(tmp_path, "ppo", 6), workers=workers, address=cluster.address, late_seconds=20.0)
     launch(config, tmp_path / "run", resume=True, stop=StopRequests())
     assert len(set(on_lost_node) - {CENTRAL}) == 3
-    assert said in (tmp_path / "run" / "log.txt").read_text()
+    log = (tmp_path / "run" / "log.txt").read_text()
+    assert said in log
+    lost = re.findall(rf"lost (.*) \(on {platform.node()}\); what was owed is computed again", log)
+    assert {"rollout actor 0", "rollout actor 1"} & set(", ".join(lost).split(", "))
+    assert len(re.findall(r"more than 2 actors take CPUs and gain nothing", log)) == 1
     assert results(tmp_path / "run") == reference
