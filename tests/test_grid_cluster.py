@@ -74,6 +74,14 @@ def test_six_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_p
     path = write_grid(tmp_path, seeds={"count": 3})
     submit = ("grid", "submit", path, "--address", cluster.address, "--root", tmp_path / "runs", "--mode", "jobs")
     both = [start(cluster, *submit) for _ in range(2)]
+    asked = start(cluster, *submit)
+    assert asked.stdout is not None
+    assert any("conducted by job" in line for line in asked.stdout)
+    asked.terminate()
+    told = asked.communicate(timeout=PATIENCE)[0]
+    assert asked.returncode == 75, told
+    assert "SIGTERM: no longer looking on; what was submitted goes on in the cluster" in told
+    assert "checkpoint, which takes" not in told
     said = [process.communicate(timeout=PATIENCE)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     assert all("small: 6 of 6 runs done" in text for text in said)

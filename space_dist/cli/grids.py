@@ -202,7 +202,7 @@ def grid_submit(
     python: Annotated[str, typer.Option(help="The cluster's Python that has space_dist.")] = "python",
 ) -> None:
     """Submit a grid to a Ray cluster. Submitted twice, it still runs once."""
-    STOP.install()
+    STOP.install("no longer looking on; what was submitted goes on in the cluster")
     with needed_from("ray", "`grid submit`"):
         from space_dist.grid.jobs import Remote
     from space_dist.api.grids import frozen
@@ -212,6 +212,8 @@ def grid_submit(
     base = root_of(root)
     place, manifest = frozen(grid, base, scale, changes or ())
     remote = Remote(address, manifest, base)
+    if reason := STOP.reason():
+        raise Interrupted(f"stopped by {reason} before it was submitted")
     job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
     say(f"{manifest.name}: conducted by job {job} at {address}")
     if detach:

@@ -54,10 +54,15 @@ class StopRequests:
         self._file: Path | None = None
         self._grace_seconds = 25.0
         self._installed = False
+        self._instead = ""
         self._since = time.time()
 
-    def install(self) -> None:
-        """Set the handlers, of a process that is there for what may be stopped: it is heard from its start on."""
+    def install(self, instead: str = "") -> None:
+        """Set the handlers, of a process that is there for what may be stopped: it is heard from its start on.
+
+        instead: what a signal has it do, where that is not a checkpoint.
+        """
+        self._instead = instead or self._instead
         if not self._installed:
             self._installed, self._since = True, _process_start()
             atexit.register(_settle)  # before anybody else's, so it comes last
@@ -126,11 +131,13 @@ class StopRequests:
                 os._exit(Interrupted.exit_code)
             return
         self._reason = signal.Signals(number).name
-        self._tell(f"{self._reason}: ending with a checkpoint, which takes up to {self._grace_seconds:g} s")
+        ending = self._instead or f"ending with a checkpoint, which takes up to {self._grace_seconds:g} s"
+        self._tell(f"{self._reason}: {ending}")
         timer = threading.Timer(self._grace_seconds, self._give_up)
         timer.daemon = True
         timer.start()
 
     def _give_up(self) -> None:
-        self._tell(f"that took too long: ended on the last checkpoint (exit code {Interrupted.exit_code})")
+        where = "" if self._instead else " on the last checkpoint"
+        self._tell(f"that took too long: ended{where} (exit code {Interrupted.exit_code})")
         os._exit(Interrupted.exit_code)
