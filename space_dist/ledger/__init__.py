@@ -39,7 +39,7 @@ from space_dist.ledger.checkpoint import (
     encode_arrays,
     encode_checkpoint,
 )
-from space_dist.ledger.folder import GIVEN, Ledger, State, Status, find_ledgers, there
+from space_dist.ledger.folder import GIVEN, GOES_BACK, Ledger, State, Status, find_ledgers, there
 from space_dist.ledger.lock import LEASE_SECONDS, Lock, believed_alive, owner_alive, process_of, this_process
 from space_dist.ledger.rows import (
     CURRICULUM,
@@ -60,6 +60,7 @@ __all__ = [
     "CURRICULUM",
     "FORMAT",
     "GIVEN",
+    "GOES_BACK",
     "LEASE_SECONDS",
     "METRICS",
     "MOST_VALUED",

@@ -22,6 +22,7 @@ from space_dist.system.files import read_file
 State = Literal["running", "interrupted", "failed", "paused", "done"]
 _MAX_STATUS_BYTES = 1 << 20
 _CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
+GOES_BACK: Final = "`train --resume` goes back to the one before it"  # behind a damaged checkpoint, where that can be
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
 
 
@@ -197,9 +198,7 @@ class Ledger:
         if name is None:
             return None
         what = "damaged" if (self.checkpoints / name).exists() else "missing"
-        way_out = (
-            "`train --resume` goes back to the one before it" if self.has_intact_checkpoint() else "no other is intact"
-        )
+        way_out = GOES_BACK if self.has_intact_checkpoint() else "no other is intact"
         raise LedgerError(f"the last checkpoint in {self.checkpoints}, {name}, is {what}; {way_out}")
 
     def has_intact_checkpoint(self) -> bool:

@@ -36,7 +36,7 @@ from space_dist.errors import (
     exits_refused,
 )
 from space_dist.learner import torch_checks
-from space_dist.ledger import FORMAT, GIVEN, METRICS, Ledger, RunWriter, State, Status, decode_checkpoint
+from space_dist.ledger import FORMAT, GIVEN, GOES_BACK, METRICS, Ledger, RunWriter, State, Status, decode_checkpoint
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
@@ -307,7 +307,7 @@ def _damage_behind(ledger: Ledger) -> list[str]:
         ledger.last_checkpoint()
     except LedgerError as error:
         if ledger.has_intact_checkpoint():
-            return [str(error)]
+            return [_without_advice(error)]
         log.warning("%s; the results of %s are whole: its checkpoints may be removed", error, ledger.folder)
     return []
 
@@ -321,8 +321,13 @@ def _damaged_checkpoint(ledger: Ledger) -> list[str]:
     try:
         ledger.last_checkpoint()
     except LedgerError as error:
-        return [str(error)] if ledger.has_intact_checkpoint() else []
+        return [_without_advice(error)] if ledger.has_intact_checkpoint() else []
     return []
+
+
+def _without_advice(error: LedgerError) -> str:
+    """What is damaged of a run that is being resumed, without the advice to resume it."""
+    return str(error).removesuffix(f"; {GOES_BACK}")
 
 
 def _also_decide(config: RunConfig) -> list[str]:

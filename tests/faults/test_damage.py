@@ -256,7 +256,7 @@ def test_going_back_is_said_outside_of_the_log_too(
     newest = Ledger(copy).checkpoint_files()[0]
     newest.write_bytes(newest.read_bytes()[:100])
     assert resumes_to_the_same_bytes_or_is_refused(config, copy, right)
-    said = f"{newest.name}, is damaged; `train --resume` goes back to the one before it; computing it again from"
+    said = f"{newest.name}, is damaged; computing it again from the last checkpoint that is intact"
     assert said in caplog.text
     # Before the log was opened: then it went to standard error.
     assert said not in (copy / "log.txt").read_text()
