@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from space_dist import config as configs
+from space_dist.api.grids import frozen
 from space_dist.cli.grids import grid_retry
 from space_dist.cli.overview import print_failures
 from space_dist.errors import ConfigError, LedgerError
@@ -280,6 +281,9 @@ def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
     assert find_grid(Path(grid.folder.name), tmp_path / "runs").folder == grid.folder  # by its name
     with pytest.raises(ConfigError, match="is frozen already"):
         find_grid(Path(grid.folder.name), tmp_path / "runs", 0.5)
+    assert frozen(Path(grid.folder.name), tmp_path / "runs")[0].folder == grid.folder
+    with pytest.raises(ConfigError, match=r"smal is neither here nor a grid in .*did you mean 'small'"):
+        frozen(Path("smal"), tmp_path / "runs")
     cell = manifest.cells[1]
     assert manifest.cell("kappa=4") == manifest.cell(cell.id) == manifest.cell(cell.id[:6]) == cell
     with pytest.raises(ConfigError, match="did you mean 'kappa=4'"):

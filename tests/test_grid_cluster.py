@@ -76,7 +76,7 @@ def test_six_jobs_submitted_by_two_at_once_run_once_each(cluster: RayHead, tmp_p
     both = [start(cluster, *submit) for _ in range(2)]
     asked = start(cluster, *submit)
     assert asked.stdout is not None
-    assert any("conducted by job" in line for line in asked.stdout)
+    assert any("conducted by job" in line and f"into {tmp_path / 'runs/small'} there" in line for line in asked.stdout)
     asked.terminate()
     told = asked.communicate(timeout=PATIENCE)[0]
     assert asked.returncode == 75, told

@@ -10,7 +10,7 @@ from space_dist.api.progress import line_of_grid, shown
 from space_dist.errors import ConfigError
 from space_dist.experiment import manifest as manifests
 from space_dist.experiment import scaling
-from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid
+from space_dist.experiment.manifest import MANIFEST, Grid, Manifest, find_grid, in_root
 from space_dist.experiment.status import RunStatus, run_statuses
 from space_dist.grid.conductor import Conductor, Overview, adopt, working_on
 from space_dist.grid.fork_server import ForkServer
@@ -111,10 +111,12 @@ def run_grid(
 def frozen(
     path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()
 ) -> tuple[Grid, Manifest]:  # fmt: skip
-    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen elsewhere.
+    """The grid a user wants to run, frozen below `root`: planned from YAML, or taken as it was frozen anywhere.
 
-    scale: the share of the seeds and steps in YAML. changes: `KEY=VALUE` for every cell of it.
+    path: also the name that it has below `root`.  scale: the share of the seeds and steps in YAML.  changes:
+    `KEY=VALUE` for every cell of it.
     """
+    path = in_root(path, root)
     if path.is_dir() or path.name == MANIFEST:
         place = find_grid(path, root, scale, changes)
         manifest = place.manifest()

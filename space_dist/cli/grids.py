@@ -42,7 +42,11 @@ grid_app = typer.Typer(no_args_is_help=True, help="Many runs: cells (settings) x
 
 GridPath = Annotated[
     Path,
-    typer.Argument(metavar="GRID", help="A grid's YAML file, its folder, or its manifest.json.", show_default=False),
+    typer.Argument(
+        metavar="GRID",
+        help="A grid's YAML file, its folder, its name below --root, or its manifest.json.",
+        show_default=False,
+    ),
 ]
 Root = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads annotations at run time
@@ -129,7 +133,9 @@ def grid_plan(
 def grid_run(
     grids: Annotated[
         list[Path],
-        typer.Argument(metavar="GRID...", help="YAML files of grids, their folders, or their manifest.json."),
+        typer.Argument(
+            metavar="GRID...", help="YAML files of grids, their folders, names below --root, or manifest.json."
+        ),
     ],
     root: Root = None,
     scale: Scale = 1.0,
@@ -215,7 +221,8 @@ def grid_submit(
     if reason := STOP.reason():
         raise Interrupted(f"stopped by {reason} before it was submitted")
     job = remote.submit(place, mode=chosen, max_in_flight=limit, py_modules=py_modules or (), python=python)
-    say(f"{manifest.name}: conducted by job {job} at {address}")
+    named = " (no --root was given)" if root is None else ""
+    say(f"{manifest.name}: conducted by job {job} at {address}; its runs go into {base / manifest.name} there{named}")
     if detach:
         say(f"`space-dist grid status {place.folder}` tells how far it is, `grid submit` again looks on")
         return
