@@ -31,7 +31,9 @@ from space_dist.grid.planning import plan
 from space_dist.ledger import Lock
 from space_dist.slurm.export import JOBS
 from space_dist.slurm.queue import queue_of
+from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import source_digest
+from tests.commanding import command
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
 
 CODE = "0" * 16
@@ -279,11 +281,11 @@ def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
     for name in (path, grid.folder, grid.manifest_file):
         assert find_grid(name, tmp_path / "runs").folder == grid.folder
     assert find_grid(Path(grid.folder.name), tmp_path / "runs").folder == grid.folder  # by its name
-    with pytest.raises(ConfigError, match="is frozen already"):
-        find_grid(Path(grid.folder.name), tmp_path / "runs", 0.5)
     assert frozen(Path(grid.folder.name), tmp_path / "runs")[0].folder == grid.folder
     with pytest.raises(ConfigError, match=r"smal is neither here nor a grid in .*did you mean 'small'"):
         frozen(Path("smal"), tmp_path / "runs")
+    with pytest.raises(ConfigError, match="is frozen already"):
+        find_grid(Path(grid.folder.name), tmp_path / "runs", 0.5)
     cell = manifest.cells[1]
     assert manifest.cell("kappa=4") == manifest.cell(cell.id) == manifest.cell(cell.id[:6]) == cell
     with pytest.raises(ConfigError, match="did you mean 'kappa=4'"):
@@ -426,6 +428,33 @@ def test_a_stopped_run_lacks_no_explanation(
     what, way = said[Cause.KILLED].splitlines()
     assert what.endswith("failed: killed by an unknown hand; no more is known")
     assert way == f"`space-dist grid retry {grid.folder} --cause killed` gives another try"
+
+
+def test_following_a_run_ends_when_nobody_works_any_more(
+    one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid, _, run = one
+    looks, lock = [0], Lock(grid.lock_file)
+
+    def look(seconds: float) -> None:  # noqa: ARG001 - the signature is `time.sleep`'s
+        looks[0] += 1
+        if looks[0] == 3:
+            lock.acquire()
+        elif looks[0] == 5:
+            lock.release()
+        assert looks[0] < 10
+
+    monkeypatch.setattr("space_dist.cli.grids.time.sleep", look)
+    monkeypatch.setattr("space_dist.cli.grids.STOP", StopRequests())
+    follow = ("grid", "logs", grid.folder, "kappa=1", "--seed", run.seed, "--follow")
+    assert command(monkeypatch, *follow) == 0
+    assert looks[0] == 6  # somebody was waited for, who came, and was gone at two looks
+    Attempts(grid.ledger(run)).begin(1, {})
+    Attempts(grid.ledger(run)).end(1, Ended(Cause.STOPPED))
+    looks[0] = 6
+    assert command(monkeypatch, *follow) == 0
+    assert looks[0] == 7  # somebody had begun it
+    assert capsys.readouterr().err.count("nobody works on the grid any more") == 2
 
 
 def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:

@@ -279,20 +279,28 @@ def grid_logs(
     cell: Annotated[str, typer.Argument(help="A cell's label, or the start of its id.")],
     seed: Seed,
     root: Root = None,
-    follow: Annotated[bool, typer.Option("--follow", help="Go on until the run has ended.")] = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Go on until the run has ended, or nobody works on the grid.")
+    ] = False,
 ) -> None:
     """What one run has said."""
     from space_dist.grid.supervisor import OUTPUT
+    from space_dist.slurm.queue import WatchedQueue
 
     place, manifest = _found(grid, root)
     run = manifest.run(cell, seed)
     ledger = place.ledger(run)
     offsets = {ledger.log: 0, ledger.folder / OUTPUT: 0}
+    [run_status] = run_statuses_of(place, manifest, [run])
+    watched, watching = WatchedQueue(place.folder), Watching(begun=run_status.attempts > 0)
     while True:
         [run_status] = run_statuses_of(place, manifest, [run])
         for path in offsets:
             offsets[path] = _print_from(path, offsets[path])
         if not follow or output_left() or run_status.condition in ("done", "failed"):
+            break
+        if watching.is_over(place, watched.now(), [run_status]):
+            warn("nobody works on the grid any more")
             break
         time.sleep(_WATCH_SECONDS)
     warn(

@@ -216,8 +216,9 @@ def workers_in_words(place: Grid, queue: Queue | None) -> str:
 class Watching:
     """When `--watch` is over: when nothing is left to do, or nobody works any more on what somebody has worked on."""
 
-    def __init__(self) -> None:
-        self._begun, self._idle = False, 0
+    def __init__(self, *, begun: bool = False) -> None:
+        """begun: whether somebody has worked on it before."""
+        self._begun, self._idle = begun, 0
 
     def is_over(self, place: Grid, queue: Queue | None, found: Sequence[RunStatus]) -> bool:
         """Told at each look. What Slurm says may be late, and was idle twice before it is believed."""
