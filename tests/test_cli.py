@@ -98,7 +98,10 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (train("env.context_visible=false"), ["all values tie", "env.context_visible"]),
         (train("learner.kind=dqn"), ["learner"]),
         (train("instances.train=nowhere.csv"), [f"{CONFIG} with --set instances.train=nowhere.csv: instances.train: "]),
-        (train(f"instances.train={TEST}"), ["overlap", "id 100"]),
+        (
+            train(f"instances.train={TEST}"),
+            [f"--set instances.train={TEST}: training and test instances overlap: both are"],
+        ),
         (train("tracking.uri=mysql://x"), ["tracking.uri", "sqlite:////absolute/path/mlflow.db"]),
         (["train", CONFIG, "--workers", "many"], ["--workers"]),
         (["train", CONFIG, "--workers", "-1"], ["space-dist: --workers -1: resources.workers: "]),

@@ -154,6 +154,7 @@ def test_configs_lists_and_copies(
     assert "pointmass_target_test, " in sets
     assert all(re.fullmatch(r"shipped:[\w/]+ +\S.{10,}", line) for line in lines), lines
     assert command(monkeypatch, "configs", "--copy", "quickstart", "mine") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "Next: space-dist grid run mine/grids/quickstart.yaml"
     copied = sorted(path.relative_to("mine").as_posix() for path in Path("mine").rglob("*.*"))
     assert copied == [
         "grids/quickstart.yaml", "instances/pointmass_uniform_test.csv", "instances/pointmass_uniform_train.csv",

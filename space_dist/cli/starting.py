@@ -16,6 +16,7 @@ from space_dist.errors import ConfigError
 _PROJECT = Path(__file__).with_name("project")
 _PROFILE, _NO_FOLDER = "slurm.yaml", "# env: { PYTHONPATH: /home/me/my_project }"
 _MAX_PATH = 1000  # characters of a value in a profile
+_RUN_BY = {"arms": "tune run", "extends": "grid run", "env": "train"}  # by a key that such a file has
 _DISGUISE = ".in"  # of files that would be taken for this package's own
 
 
@@ -53,7 +54,7 @@ def configs(
 
 
 def _copy(name: str, out: Path) -> None:
-    from space_dist.config import located, shipped_files, with_what_it_names
+    from space_dist.config import located, read_yaml, shipped_files, with_what_it_names
     from space_dist.config.shipped import FOLDER, PREFIX
 
     chosen = located(PREFIX + name.removeprefix(PREFIX))
@@ -63,6 +64,9 @@ def _copy(name: str, out: Path) -> None:
     for one in files:
         write(out / one, (FOLDER / one).read_text())
         say(str(out / one))
+    keys = read_yaml(FOLDER / file) if file.endswith(".yaml") else {}
+    if command := next((command for key, command in _RUN_BY.items() if key in keys), ""):
+        say(f"Next: space-dist {command} {out / file}")
 
 
 def _refuse_what_is_there(paths: list[Path]) -> None:

@@ -75,6 +75,7 @@ def explain(
         lines.append(
             f"Lines 10-11: d_t(i) = V_t(i) - V_t-1(i), from {_short(numbers['smallest_pic'])} to "
             f"{_short(numbers['largest_pic'])}. Ranked by: {ranking}{', reversed' if _reversed(settings) else ''}"
+            f"{', which does not look at d_t' if ranking == settings.kind else ''}"
         )
     else:
         lines.append(f"Lines 6-11: {settings.kind} asks no values; the order never changes")
