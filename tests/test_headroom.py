@@ -85,10 +85,12 @@ def test_shares_and_first_successes_by_hand() -> None:
 def test_words() -> None:
     even = [state([[4, 4]], [[2, 2]]) for _ in range(3)]
     assert verdict(measured(even, 10)).startswith("Most of what is drawn teaches:")
-    rare = [state([[4, 4]], [[0, 4]]) for _ in range(3)]
+    rare = [state([[4] * 40], [[0, 4] * 20]) for _ in range(3)]
     assert verdict(measured(rare, 10)).startswith("In no part of the run draws had more than 0% of the signal")
-    solved = [state([[4, 4], [4, 4], [4, 4]], [[0, 0], [2, 2], [4, 4]]) for _ in range(3)]
+    solved = [state([[4] * 40] * 3, [[0] * 40, [2] * 40, [4] * 40]) for _ in range(3)]
     assert "draws had 133% of the signal: on a world with such a part" in verdict(measured(solved, 10))
+    short = [state([[4] * 20] * 3, [[0] * 20, [2] * 20, [4] * 20]) for _ in range(3)]
+    assert verdict(measured(short, 10)).startswith("In no part of the run 30 instances had two episodes")
     never = in_words(measured([state([[4, 4]], [[0, 0]])], 10))
     assert len(never) == 1
     assert "Nothing succeeded in 10 steps" in never[0]

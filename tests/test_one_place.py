@@ -162,6 +162,7 @@ def test_an_idle_supervisor_that_was_killed_costs_no_attempt(gate: Path, tmp_pat
         await_(lambda: bool(found.extend(place.poll()) or found), "the first attempt to end")
         [supervisor] = supervisors()
         kill(supervisor)
+        await_(lambda: not lives(supervisor), "the supervisor to die: while it does, it may still be given work")
         place.start([(second, 1)])
         await_(lambda: bool(found.extend(place.poll()) or len(found) == 2), "the second attempt to end")
         [another] = supervisors()

@@ -318,7 +318,10 @@ def test_an_exported_folder_says_where_its_results_are(
     for what, name, asked in ((GRID, "pointmass_small", "grid"), (tune, "search", "tune")):
         export_it = ("slurm", "export", what, "--out", out / asked)
         told(*export_it, "--root", root)
-        said = f"{out / asked} was exported with --root, and holds no results: name '{root / name}' instead"
+        said = f"{out / asked} was exported with --root, and holds no results: "
+        assert f"{said}its jobs will put them into '{root / name}'" in told(asked, "status", out / asked)
+        (root / name).mkdir(parents=True)
+        said += f"name '{root / name}' instead"
         assert said in told(asked, "status", out / asked)
         assert said in told("grid", "stop", out / asked)
         told(*export_it)

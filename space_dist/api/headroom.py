@@ -22,6 +22,7 @@ from space_dist.report.headroom import Headroom
 from space_dist.report.headroom_figure import draw_headroom
 from space_dist.report.tables import to_csv
 from space_dist.run.building import Blueprint
+from space_dist.system.workplace import workplace
 
 SHARES: Final = 10  # of the steps, over which signal is followed
 _BASE, _GRID, _NAME = "config.yaml", "headroom.yaml", "headroom"
@@ -36,11 +37,14 @@ class Measured:
     states: list[WatchedState]
     folder: Path
 
+    def __repr__(self) -> str:
+        return f"Measured({str(self.folder)!r}: {reports.verdict(self.headroom)})"
+
 
 def measure_headroom(
     config: Config,
     *,
-    out: Path | str,
+    out: Path | str | None = None,
     steps: int | None = None,
     seeds: int = 5,
     overrides: Overrides = (),
@@ -48,13 +52,14 @@ def measure_headroom(
 ) -> Measured:
     """Train with uniform draws, and count what every instance shows: see `space_dist.report.headroom`.
 
-    config, overrides: as of `train`; its curriculum plays no part.  out: a folder; measured twice, it goes on where it
-    stopped.  steps: environment steps of each run; None: a fifth of the config's budget.  seeds: how many runs.
+    config, overrides: as of `train`; its curriculum plays no part.  out: a folder; None: `runs/<name>_headroom` here.
+    Measured twice, it goes on where it stopped.  steps: environment steps of each run; None: a fifth of the config's
+    budget.  seeds: how many runs.
 
     Raises ConfigError for every fault of the config, SpaceDistError if a run fails.
     """
     settings = as_config(config, overrides)
-    folder = Path(out).absolute()
+    folder = (workplace() / "runs" / f"{settings.name}_headroom" if out is None else Path(out)).absolute()
     blueprint = _watched(settings, steps)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _BASE).write_text(configs.dump(blueprint.config))

@@ -40,7 +40,7 @@ class ReportView:
         return self.markdown
 
     def __repr__(self) -> str:
-        return f"ReportView({str(self.folder)!r}: {len(self.table)} rows, {len(self.figures)} figures; print(report))"
+        return f"ReportView({str(self.folder)!r}, rows: {len(self.table)}, figures: {len(self.figures)})"
 
     def _repr_html_(self) -> str:
         """The table, what belongs below it, and the figures, as notebooks show them."""

@@ -58,14 +58,12 @@ def headroom(
     from space_dist.api.headroom import measure_headroom
     from space_dist.api.training import as_config
     from space_dist.report import headroom as reports
-    from space_dist.system.workplace import workplace
 
     settings = as_config(config, overrides or ())
-    folder = workplace() / "runs" / f"{settings.name}_headroom" if out is None else out
     runs = "1 run" if seeds == 1 else f"{seeds} runs"
-    warn(f"{settings.name}: {runs} of uniform draws, in {folder}")
+    warn(f"{settings.name}: {runs} of uniform draws, in {out or f'runs/{settings.name}_headroom'}")
     try:
-        found = measure_headroom(settings, out=folder, steps=steps, seeds=seeds, progress=console.is_terminal)
+        found = measure_headroom(settings, out=out, steps=steps, seeds=seeds, progress=console.is_terminal)
     except KeyboardInterrupt:
         raise Interrupted("ending with checkpoints; the same command goes on from there") from None
     rows, words = reports.table(found.headroom), reports.in_words(found.headroom)

@@ -504,10 +504,9 @@ def tell_results_elsewhere(place: Grid) -> None:
     from space_dist.slurm.export import results_elsewhere
 
     if (results := results_elsewhere(place.folder)) is not None:
-        warn(
-            f"{place.folder} was exported with --root, and holds no results: name {shlex.quote(str(results))} instead, "
-            "where they are"
-        )
+        named = shlex.quote(str(results))
+        where = f"name {named} instead, where they are" if results.exists() else f"its jobs will put them into {named}"
+        warn(f"{place.folder} was exported with --root, and holds no results: {where}")
 
 
 def mode_of(text: str) -> Mode:

@@ -207,7 +207,7 @@ def _store_of_environment(uri: str, *, ask: bool) -> Iterator[Finding]:
     elif ask:
         why = _failure(_ASK_MLFLOW, "server")
         yield Finding("ok", f"{URI_VARIABLE}: an MLflow answers at {parts.netloc}") if why is None else Finding(
-            "broken", f"{URI_VARIABLE}: no MLflow answers at {parts.netloc}: {why}",
+            "broken", f"{URI_VARIABLE}: no MLflow answers at {parts.netloc}: {_sentence(why)}",
             f"start the server, or unset {URI_VARIABLE}; nothing of a run is lost meanwhile (space-dist sync)",
         )  # fmt: skip
 
@@ -245,6 +245,11 @@ def slurm_here() -> Iterator[Finding]:
         )  # fmt: skip
         if not fine:
             return
+
+
+def _sentence(why: str) -> str:
+    """The first sentence of what an exception of ours says."""
+    return why.partition("Error: ")[2].partition(". ")[0] or why
 
 
 def _noted_unless(fine: bool, what: str, otherwise: str, mend: str) -> Finding:

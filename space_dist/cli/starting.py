@@ -48,7 +48,7 @@ def configs(
     width = max(map(len, files)) - len(".yaml")
     for file in sorted(files, key=lambda file: ("/" in file, file)):
         say(f"shipped:{file.removesuffix('.yaml'):{width}}  {about_shipped(file)}")
-    sets = [Path(file).stem for file in shipped_files() if file.endswith(".csv")]
+    sets = [file.removeprefix("instances/").removesuffix(".csv") for file in shipped_files() if file.endswith(".csv")]
     say(f"and as instance sets, in shipped:instances/NAME.csv: {', '.join(sets)}")
     delivered()
 

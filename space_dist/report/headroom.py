@@ -29,6 +29,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LITTLE: Final = 0.5  # signal or evenness from which on most of what is drawn teaches
+JUDGED: Final = 30  # instances with two episodes or more, from which on a share of the steps is looked at by itself
 FEW: Final = 0.1  # signal that is reached in no share of the steps where a curriculum saved half of them (docs/wins.md)
 ALIKE: Final = 0.01  # of the span of all returns: failures that differ by less are paid alike
 
@@ -41,7 +42,7 @@ class Headroom:
     `(s, w)`, NaN without advantages.  solved: `(s, w)` share of episodes that succeeded.  never, always: `(s, w)` share
     of the instances with episodes of which none, or each, succeeded.  first: `(s,)` steps by the end of the share in
     which the first success fell; NaN: there was none.  failures: least and greatest return of an episode that failed,
-    where these are not all alike: then failures teach.
+    where these are not all alike: then failures teach.  judged: `(s, w)` how many instances `signal` is the mean over.
     """
 
     steps: int
@@ -51,6 +52,7 @@ class Headroom:
     never: FloatArray
     always: FloatArray
     first: FloatArray
+    judged: FloatArray
     failures: tuple[float, float] | None = None
 
     def over_all(self, measure: FloatArray) -> Interval:
@@ -115,12 +117,14 @@ def _of_run(state: WatchedState, steps: int) -> dict[str, Any]:
     uneven = evenness(episodes, state.sizes)
     if not state.knows_success:
         nothing = dict.fromkeys(("signal", "solved", "never", "always"), unknown)
-        return {**nothing, "evenness": uneven, "first": float("nan")}
+        return {**nothing, "evenness": uneven, "first": float("nan"), "judged": np.zeros(len(episodes))}
+    judged = (episodes >= 2).sum(axis=1).astype(np.float64)
     won = np.flatnonzero(successes.any(axis=1))
     first = (won[0] + 1) * steps / len(episodes) if len(won) else float("nan")
     return {
         "signal": signal(episodes, successes),
         "evenness": uneven,
+        "judged": judged,
         "solved": np.divide(successes.sum(axis=1), episodes.sum(axis=1), out=unknown.copy(), where=played.any(axis=1)),
         "never": _mean((successes == 0).astype(np.float64), played),
         "always": _mean((successes == episodes).astype(np.float64), played),
@@ -182,7 +186,13 @@ def verdict(found: Headroom) -> str:
             "Advantages differ from instance to instance, which promises nothing: on a world with a reward at every "
             "step that looked so, no curriculum was better than round robin (docs/wins.md)."
         )
-    most = max(_average(share) for share in found.signal.T if not np.isnan(share).all())
+    parts = [_average(share) for share, judged in zip(found.signal.T, found.judged.T, strict=True)
+             if judged.mean() >= JUDGED]  # fmt: skip
+    if not parts or np.isnan(found.first).all():
+        return (
+            f"In no part of the run {JUDGED} instances had two episodes, so this says no more: --steps gives longer runs."
+        )
+    most = max(parts)
     if most >= FEW:
         return (
             f"In the part of the run where most was taught, draws had {most:.0%} of the signal: on a world with such a "
