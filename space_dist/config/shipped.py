@@ -38,7 +38,7 @@ def located(path: Path | str) -> Path:
     if len(found) == 1:
         return FOLDER / found[0]
     if found:
-        raise ConfigError(f"{path}: several files are called so: {', '.join(found)}")
+        raise ConfigError(f"{path}: several files are called so: {', '.join(found)}; name one of them whole")
     names = [short for file in files for short in (file, file.rpartition(".")[0], Path(file).stem, Path(file).name)]
     raise ConfigError(
         f"{path}: nothing of this name comes with space_dist{nearest(name, names)} `space-dist configs` lists what does"

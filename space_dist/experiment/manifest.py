@@ -352,7 +352,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
         small = "" if scale == scaling.WHOLE else f" --scale {scale:g}"
         small += "".join(f" --set {shlex.quote(change)}" for change in changes)
         raise NotPlannedError(
-            f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}{small}` freezes it there "
-            "(--root names another root)"
+            f"the grid of {path} is not in {grid.folder}: `space-dist grid plan {path}{small}` freezes it there, "
+            "and `grid run` with the same words runs it, too (--root names another root)"
         )
     return grid
