@@ -68,6 +68,11 @@ def nearest(word: str, allowed: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else "."
 
 
+def counted(number: int, what: str) -> str:
+    """`1 run`, `2,000 runs`."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
 @contextlib.contextmanager
 def about(where: str, changes: Mapping[str, str] = MappingProxyType({})) -> Iterator[None]:
     """Say where a fault lies: the file or key goes before its sentence, unless it is there already.

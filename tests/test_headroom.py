@@ -83,14 +83,17 @@ def test_shares_and_first_successes_by_hand() -> None:
 
 
 def test_words() -> None:
-    even = [state([[4, 4]], [[2, 2]]) for _ in range(3)]
+    even = [state([[4] * 40], [[2] * 40]) for _ in range(3)]
     assert verdict(measured(even, 10)).startswith("Most of what is drawn teaches:")
     rare = [state([[4] * 40], [[0, 4] * 20]) for _ in range(3)]
     assert verdict(measured(rare, 10)).startswith("In no part of the run draws had more than 0% of the signal")
     solved = [state([[4] * 40] * 3, [[0] * 40, [2] * 40, [4] * 40]) for _ in range(3)]
-    assert "draws had 133% of the signal: on a world with such a part" in verdict(measured(solved, 10))
+    assert "draws had 100% of the signal: on a world with such a part" in verdict(measured(solved, 10))
     short = [state([[4] * 20] * 3, [[0] * 20, [2] * 20, [4] * 20]) for _ in range(3)]
     assert verdict(measured(short, 10)).startswith("In no part of the run 30 instances had two episodes")
+    few = [state([[4, 4]], [[2, 2]]) for _ in range(3)]  # at even odds, and far too few to say so
+    assert verdict(measured(few, 10)).startswith("In no part of the run 30 instances had two episodes")
+    assert verdict(measured([state([[4] * 40], [[0] * 40])], 10)).startswith("Nothing succeeded")
     never = in_words(measured([state([[4, 4]], [[0, 0]])], 10))
     assert len(never) == 1
     assert "Nothing succeeded in 10 steps" in never[0]

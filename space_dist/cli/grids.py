@@ -16,7 +16,6 @@ import typer
 
 from space_dist.cli.overview import (
     Watching,
-    counted,
     display,
     print_cells,
     print_failures,
@@ -26,7 +25,7 @@ from space_dist.cli.overview import (
     workers_in_words,
 )
 from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one_of, output_left, say, warn
-from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
+from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError, counted
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile
 

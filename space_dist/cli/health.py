@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 import typer
 
 from space_dist.cli.terminal import delivered, say
-from space_dist.config.tracking_uri import URI_VARIABLE, UriError, checked_uri
 from space_dist.system.importing import PYTHON
 
 _NEEDED: Final = (
@@ -185,12 +184,15 @@ def mlflow_works(*, ask: bool) -> Iterator[Finding]:
         yield _not_imported(f"MLflow {version}", why, "mlflow")
         return
     yield Finding("ok", f"MLflow {version}")
-    if uri := os.environ.get(URI_VARIABLE, ""):
-        yield from _store_of_environment(uri, ask=ask)
+    yield from _store_of_environment(ask=ask)
 
 
-def _store_of_environment(uri: str, *, ask: bool) -> Iterator[Finding]:
-    """What MLFLOW_TRACKING_URI names: where runs are mirrored to, unless a config says otherwise."""
+def _store_of_environment(*, ask: bool) -> Iterator[Finding]:
+    """What MLFLOW_TRACKING_URI names, if it is set: where runs are mirrored to, unless a config says otherwise."""
+    from space_dist.config.tracking_uri import URI_VARIABLE, UriError, checked_uri
+
+    if not (uri := os.environ.get(URI_VARIABLE, "")):
+        return
     try:
         parts = urlsplit(checked_uri(uri))
     except UriError as error:

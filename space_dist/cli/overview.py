@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from space_dist.cli.terminal import console, say
-from space_dist.errors import SpaceDistError
+from space_dist.errors import SpaceDistError, counted
 from space_dist.experiment.endings import Cause
 
 if TYPE_CHECKING:
@@ -180,11 +180,6 @@ def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:
         say(f"and {len(unwell) - _SHOWN_RUNS} more: --by-cause shows all")
     for way in dict.fromkeys(one.way_out for one in unwell if one.condition == "failed"):
         say(way)
-
-
-def counted(number: int, what: str) -> str:
-    """`1 run`, `2 runs`."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _why(run_status: RunStatus) -> str:

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, say, warn, write
-from space_dist.errors import ConfigError, about, exits_refused
+from space_dist.errors import ConfigError, about, counted, exits_refused
 
 if TYPE_CHECKING:
     from space_dist.experiment.manifest import Grid
@@ -339,7 +339,7 @@ def sync(
         result = follow_runs(paths, uri, experiment)
     else:
         result = sync_runs(found.ledgers, uri, experiment, grids=found.grids, tell=say)
-    mirrored = "1 run is" if result.runs == 1 else f"{result.runs} runs are"
+    mirrored = f"{counted(result.runs, 'run')} {'is' if result.runs == 1 else 'are'}"
     console.print(
         f"{mirrored} up to date in MLflow ({result.created} new, {result.rows} rows pushed"
         + (f", {result.skipped} have no tracking.uri)" if result.skipped else ")"),

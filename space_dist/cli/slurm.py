@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional, cast
 
@@ -22,10 +22,10 @@ from space_dist.cli.grids import (
     prepare,
     run_frozen,
 )
-from space_dist.cli.overview import counted, tell
+from space_dist.cli.overview import tell
 from space_dist.cli.terminal import STOP, one_of, say, warn
 from space_dist.cli.tuning import tell_outcome, tune_confirm
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import ConfigError, SpaceDistError, counted
 from space_dist.system.extras import needed_from
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def slurm_export(
 
     Those of a search train generation after generation, and submit the next ones themselves.
     """
-    from space_dist.config.reading import from_option, told
+    from space_dist.config.reading import from_option
     from space_dist.slurm import Export, export, load_profile
 
     chosen = cast("Mode", one_of(_MODES, mode, "--mode"))
@@ -99,22 +99,12 @@ def slurm_export(
     options = [("--throttle", "throttle", throttle), ("--cells-per-task", "cells_per_task", cells_per_task)]
     settings = [from_option(*option) for option in options if option[-1] is not None]
     site = load_profile(profile, [*(overrides or ()), *settings])
-    for override in overrides or ():
-        # A site's file may have it for the other mode; who types it expects something of it.
-        if chosen == "array" and override.partition("=")[0].strip() == "nodes" and site.nodes > 1:
-            raise ConfigError(
-                f"{told(override)}: nodes is for --mode cluster, one Ray over the nodes of a job; in array mode, the "
-                "default, each task has one node"
-            )
+    _refuse_nodes(overrides or (), site, chosen)
     manifest, instances = _frozen(grid, out)
     made = Export(manifest, site, chosen, None if root is None else root.absolute())
     for path in export(made, instances, out, templates):
         say(str(path))
-    tasks = (
-        f"{made.n_tasks} array task{'' if made.n_tasks == 1 else 's'}"
-        if mode == "array"
-        else f"one job of {counted(site.nodes, 'node')}"
-    )
+    tasks = counted(made.n_tasks, "array task") if mode == "array" else f"one job of {counted(site.nodes, 'node')}"
     at_most = "" if manifest.search is None else "at most "
     runs = counted(made.n_runs, "run")
     say(f"{manifest.name}: {at_most}{runs} in {tasks}; {out / 'README.md'} says what to do with it")
@@ -123,6 +113,18 @@ def slurm_export(
     if check:
         _check_environment(site)
         _check(out, made.scripts)
+
+
+def _refuse_nodes(overrides: Sequence[str], site: Profile, mode: Mode) -> None:
+    """Raise ConfigError for `--set nodes=N` of arrays. A site's file may have it, for the other mode."""
+    from space_dist.config.reading import told
+
+    for override in overrides:
+        if mode == "array" and override.partition("=")[0].strip() == "nodes" and site.nodes > 1:
+            raise ConfigError(
+                f"{told(override)}: nodes is for --mode cluster, one Ray over the nodes of a job; in array mode, the "
+                "default, each task has one node"
+            )
 
 
 @slurm_app.command("submit")

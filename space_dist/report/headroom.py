@@ -179,6 +179,14 @@ def verdict(found: Headroom) -> str:
     known = found.signal if by_outcome else found.evenness
     if np.isnan(known).all():
         return "Neither success nor advantages are known: nothing can be said."
+    if by_outcome and np.isnan(found.first).all():
+        return "Nothing succeeded: what a curriculum could save behind the first success is not known."
+    parts = [_average(share) for share, judged in zip(found.signal.T, found.judged.T, strict=True)
+             if judged.mean() >= JUDGED]  # fmt: skip
+    if by_outcome and not parts:
+        return (
+            f"In no part of the run {JUDGED} instances had two episodes, so this says no more: --steps gives longer runs."
+        )
     if found.over_all(known).value >= LITTLE:
         return "Most of what is drawn teaches: expect little of a curriculum here."
     if not by_outcome:
@@ -186,21 +194,15 @@ def verdict(found: Headroom) -> str:
             "Advantages differ from instance to instance, which promises nothing: on a world with a reward at every "
             "step that looked so, no curriculum was better than round robin (docs/wins.md)."
         )
-    parts = [_average(share) for share, judged in zip(found.signal.T, found.judged.T, strict=True)
-             if judged.mean() >= JUDGED]  # fmt: skip
-    if not parts or np.isnan(found.first).all():
-        return (
-            f"In no part of the run {JUDGED} instances had two episodes, so this says no more: --steps gives longer runs."
-        )
-    most = max(parts)
+    most = min(1.0, max(parts))  # without bias, so of few episodes it may be more
     if most >= FEW:
         return (
             f"In the part of the run where most was taught, draws had {most:.0%} of the signal: on a world with such a "
             "part a curriculum was no faster than uniform draws (docs/wins.md)."
         )
     return (
-        f"In no part of the run draws had more than {most:.0%} of the signal: in such worlds a curriculum needed half "
-        "of the steps or less (docs/wins.md), so there is room for one."
+        f"In no part of the run draws had more than {most:.0%} of the signal, so there is room for a curriculum: on "
+        "worlds that looked so one needed less than half of the steps, once its learner was well tuned (docs/wins.md)."
     )
 
 

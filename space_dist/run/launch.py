@@ -33,6 +33,7 @@ from space_dist.errors import (
     LedgerError,
     RunLockedError,
     SpaceDistError,
+    counted,
     exits_refused,
 )
 from space_dist.learner import torch_checks
@@ -476,11 +477,6 @@ def policy_of(ledger: Ledger, spec: EnvironmentSpec) -> Policy | Several:
     return Blueprint(stored_config(ledger), spec).policy_in(checkpoint)
 
 
-def _in_number(count: int, what: str) -> str:
-    """`1 shard`, `2 shards`."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
-
-
 @contextlib.contextmanager
 def _cluster(
     active: ActiveRun, waiting: Callable[[str], None], tell: Callable[[str], None]
@@ -499,10 +495,10 @@ def _cluster(
     shards = active.blueprint.config.rollout.shards
     if workers > shards:
         told(
-            f"resources.workers: {workers}: a round has {_in_number(shards, 'shard')} (rollout.shards), so more than "
-            f"{_in_number(shards, 'actor')} take CPUs and gain nothing"
+            f"resources.workers: {workers}: a round has {counted(shards, 'shard')} (rollout.shards), so more than "
+            f"{counted(shards, 'actor')} take CPUs and gain nothing"
         )
-    actors = _in_number(workers, "rollout actor")
+    actors = counted(workers, "rollout actor")
     if config.resources.address == "local":
         waiting(f"starting Ray with {actors}")
         private_ray()

@@ -23,7 +23,7 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from space_dist import config as configs
 from space_dist.config import clean
-from space_dist.errors import ConfigError, LedgerError, nearest
+from space_dist.errors import ConfigError, LedgerError, counted, nearest
 from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.experiment.tuning import confirmation_of
 from space_dist.slurm.arrays import Array, arrays_of
@@ -449,7 +449,7 @@ def _shell_line(*words: object) -> _Safe:
 
 
 def _counted(number: int, what: str) -> _Safe:
-    return _Safe(f"{number:,} {what}{'' if number == 1 else 's'}")
+    return _Safe(counted(number, what))
 
 
 def _quoted(value: Any) -> Any:
