@@ -13,7 +13,10 @@ from urllib.parse import urlsplit
 
 from space_dist.errors import ConfigError
 
-ALLOWED: Final = "allowed are sqlite:////absolute/path/mlflow.db and http(s)://HOST:PORT of an MLflow server"
+ALLOWED: Final = (
+    "allowed are sqlite:///mlflow.db (in the current folder), sqlite:////absolute/path/mlflow.db, and "
+    "http(s)://HOST:PORT of an MLflow server"
+)
 AUTO: Final = "auto"
 DEFAULT: Final = "sqlite:///mlflow.db"
 URI_VARIABLE: Final = "MLFLOW_TRACKING_URI"
