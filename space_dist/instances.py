@@ -35,13 +35,15 @@ _WIDE: Final = 1e300  # bounds where none are known
 class ContextBounds:
     """The features of an environment's contexts and the closed interval each may lie in, in the environment's units.
 
-    `names` are the d features, `low` and `high` are `(d,)`. Raises ConfigError unless the names are distinct, can
+    `names` are the d features, `low` and `high` are `(d,)`. `lower`, by feature: a lower bound that a setting of the
+    environment allows, and that setting, for sentences alone. Raises ConfigError unless the names are distinct, can
     stand in a CSV header as they are, and low < high, both finite.
     """
 
     names: tuple[str, ...]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    lower: Mapping[str, tuple[float, str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_names(self.names)
@@ -451,6 +453,9 @@ def _cell_fault(row: int, columns: Sequence[str], cells: Sequence[bytes], positi
             if b"_" in cell:
                 raise ValueError
             what = "is outside the bounds" if np.isfinite(float(cell)) else "is not finite"
+            least, setting = bounds.lower.get(column, (np.inf, ""))
+            if least <= float(cell) < bounds.low[feature]:
+                allowed += f", and from {least:g} with {setting}"
         except ValueError:
             what = "is not a number"
     return f"row {row}, column {shown(column)}: {shown(cell)} {what}; allowed is {allowed}"

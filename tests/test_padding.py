@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from space_dist.envs import BATCHED, make_batched
 from space_dist.envs.distributions import sample
 from space_dist.envs.interface import DrawsUnsolvable
 from space_dist.envs.padding import pad
+from space_dist.envs.pointmass import BOUNDS
 from space_dist.envs.sparse_pointmass import BatchedSparsePointMass
 from space_dist.errors import ConfigError
-from space_dist.instances import PADDING_IDS, ContextBounds, InstanceSet
+from space_dist.instances import PADDING_IDS, ContextBounds, InstanceSet, read_csv
 from space_dist.run.building import Blueprint
 from tests.commanding import command
 from tests.faulty_env import Honest
@@ -246,8 +248,15 @@ def test_a_padded_set_is_not_padded_again_and_no_test_set(tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match=r"instances\.test: .*train\.csv: 10 of 20 instances are padding"):
         Blueprint.of(turned).instances()
     without = configs.load(ROOT / "configs/sparse_pointmass_space.yaml", both)
-    with pytest.raises(ConfigError, match=r"'gate_width': '0\.0' is outside the bounds"):
+    allowed = (
+        "'gate_width': '0.0' is outside the bounds; allowed is a number in [0.5, 8.0], and from 0 with "
+        "env.kwargs.closed_gates: true (--kwarg closed_gates=true)"
+    )
+    with pytest.raises(ConfigError, match=re.escape(allowed)):
         Blueprint.of(without).instances()
+    (tmp_path / "beyond.csv").write_text("id,gate_x,gate_width,friction\n0,0,-1,0\n")
+    with pytest.raises(ConfigError, match=r"'-1' is outside the bounds; allowed is a number in \[0\.5, 8\.0\]$"):
+        read_csv(tmp_path / "beyond.csv", BOUNDS)
 
 
 def test_ids_below_are_nobodys_padding() -> None:
