@@ -156,11 +156,38 @@ class Mine(PPO):
     assert "extra_state()" in said
 
 
-def test_a_run_that_failed_before_its_first_round_holds_nobody_up(example: Path) -> None:
-    """As by a wrong argument: nothing is lost if the config that was put right takes its folder."""
+@pytest.mark.parametrize(
+    ("kwargs", "said"),
+    [
+        ("{targte: 3.0}", "argument 'targte'; did you mean 'target'? Its own are: target, rate"),
+        ("{zzz: 3.0}", "argument 'zzz'. Its own are: target, rate"),
+        ("{n_epochz: 3}", "argument 'n_epochz'; did you mean 'n_epochs'? That stands beside kwargs: learner.n_epochs. "
+                            "Its own are: target, rate"),
+        ("{target_kl: 3.0}", "'target_kl' is an argument of Stable-Baselines3's ppo, and stands beside kwargs: "
+                             "learner.target_kl"),
+    ],
+)  # fmt: skip
+def test_arguments_that_its_class_does_not_take_are_refused_by_check_and_run_alike(
+    example: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kwargs: str, said: str
+) -> None:
+    for line in (["config", "check"], ["train", "--out", "run"]):
+        assert command(monkeypatch, *line, "my_learner.yaml", "--set", f"learner.kwargs={kwargs}") == 2
+        text = " ".join(capsys.readouterr().err.split())
+        assert text.startswith(f"space-dist: my_learner.yaml with --set learner.kwargs={kwargs}: learner.")
+        assert text.endswith(said)
+    assert not (example / "run").exists()
+
+
+def test_a_run_that_failed_before_its_first_round_holds_nobody_up(
+    example: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by a class that cannot be made on that machine: nothing is lost if another config takes its folder."""
     right, run = chosen("learner.kwargs={target: 3.0}"), example / "run"
-    with pytest.raises(SpaceDistError, match="cannot be made of"):
-        launch(chosen("learner.kwargs={targte: 3.0}"), run, resume=False, stop=StopRequests())
+    setup = Blueprint.of(right).setup(*Blueprint.of(right).instances())
+    with monkeypatch.context() as patched:
+        patched.setattr(Blueprint, "setup", lambda *_: setup)  # which would have refused it
+        with pytest.raises(SpaceDistError, match="cannot be made of"):
+            launch(chosen("learner.kwargs={targte: 3.0}"), run, resume=False, stop=StopRequests())
     assert Ledger(run).status().state == "failed"
     (run / "metrics.jsonl").touch()  # as of one that failed later
     with pytest.raises(SpaceDistError, match="already holds a run"):

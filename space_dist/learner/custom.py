@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -29,6 +29,8 @@ Numbers = Mapping[str, "bool | int | float"]
 _NEVER_CALLED: Final = ("learn", "collect_rollouts", "predict", "_sample_action", "_store_transition", "dump_logs")
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 _STORED_KINDS: Final = "biuf"  # of arrays: truth values, whole numbers, floats
+_BY_NAME: Final = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+_UNKNOWN: Final = re.compile(r"unexpected keyword argument '(\w+)'")
 _DEEPEST: Final = 6  # how far into an attribute's parts is looked
 
 # What checkpoints hold of every algorithm, what every round sets anew, and what only counts for SB3's own loop.
@@ -78,13 +80,50 @@ def made(algorithm: Callable[..., Any], config: LearnerConfig, *arguments: Any, 
     """An algorithm of these arguments, and of `learner.kwargs` if it is one's own. Raises ConfigError if it is none."""
     if config.import_path is None:
         return algorithm(*arguments, **settings)
-    taken = {*inspect.signature(ALGORITHMS[config.kind].__init__).parameters, *settings}
+    base = ALGORITHMS[config.kind]
+    taken = {*inspect.signature(base.__init__).parameters, *settings}
     if both := sorted(taken & {*config.kwargs}):
+        has_key = both[0] in type(config).model_fields
         raise ConfigError(
-            f"learner.kwargs: {both[0]!r} is an argument of Stable-Baselines3's {config.kind}; kwargs are those that "
-            "your own class has beside them. What the config has no key for, your __init__ can set"
-        )
-    return _own_code(config, "be made of learner.kwargs", lambda: algorithm(*arguments, **settings, **config.kwargs))
+            f"learner.kwargs: {both[0]!r} is an argument of Stable-Baselines3's {config.kind}"
+            + (
+                f", and stands beside kwargs: learner.{both[0]}" if has_key
+                else "; kwargs are those that your own class has beside them. What the config has no key for, your "
+                "__init__ can set"
+            )
+        )  # fmt: skip
+
+    def called() -> Any:
+        try:
+            return algorithm(*arguments, **settings, **config.kwargs)
+        except TypeError as error:
+            unknown = _UNKNOWN.search(str(error))
+            if unknown is None or unknown[1] not in config.kwargs:
+                raise
+            hint = _meant(unknown[1], _own_arguments(algorithm, base, taken), config)
+            raise TypeError(f"{error}{hint}") from error
+
+    return _own_code(config, "be made of learner.kwargs", called)
+
+
+def _own_arguments(algorithm: Callable[..., Any], base: type, taken: Collection[str]) -> list[str]:
+    """The arguments that a class derived from `base` has beside those that are taken, as far as it names them."""
+    line = inspect.getmro(algorithm) if isinstance(algorithm, type) else ()
+    found: dict[str, None] = {}
+    for part in line[: line.index(base)] if base in line else ():
+        if "__init__" in vars(part):
+            named = inspect.signature(vars(part)["__init__"]).parameters.values()
+            found |= {one.name: None for one in named if one.kind in _BY_NAME and one.name not in taken}
+    return list(found)
+
+
+def _meant(word: str, own: list[str], config: LearnerConfig) -> str:
+    """What to say of an argument that a class does not take, behind that: the nearest, and where it stands."""
+    keys = [name for name in type(config).model_fields if name not in own]
+    hint = nearest(word, [*own, *keys])
+    if beside := next((name for name in keys if f" {name!r}?" in hint), None):
+        hint += f" That stands beside kwargs: learner.{beside}."
+    return f"{hint} Its own are: {', '.join(own)}" if own else hint.removesuffix(".")
 
 
 def set_up(model: BaseAlgorithm, config: LearnerConfig) -> None:

@@ -136,6 +136,8 @@ class Blueprint:
         self.ensemble()
         if config.init_from is not None:
             start_from(self.learner(), self.given["init_from"])
+        elif config.learner.import_path is not None:
+            self.learner()  # what its class takes of learner.kwargs is known once it has taken it
         return setup
 
     def curriculum(self, train: InstanceSet, test: InstanceSet) -> Curriculum:
