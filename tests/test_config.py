@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import select
 import signal
@@ -240,6 +241,28 @@ def test_unknown_keys_are_named_with_the_nearest(key: str, meant: str, tmp_path:
     assert f"--set {key}=1: {key}: unknown key; did you mean {meant!r}?" in refusal(SPACE, f"{key}=1")
 
 
+@pytest.mark.parametrize(
+    ("learner", "said"),
+    [
+        ("{kind: ppo, target_klx: 0.1}", "learner.target_klx: unknown key; did you mean 'target_kl'? Allowed here: "),
+        ("{kind: ppo, use_sde: true}", "use_sde: unknown key. Stable-Baselines3 has it, and runs here do without. Al"),
+        ("{kind: ppo, use_sd: true}", "use_sd: unknown key; did you mean 'use_sde'? Stable-Baselines3 has it, and r"),
+        ("{kind: ppo, clip_range_vf: 1}", "unknown key. Stable-Baselines3's ppo has it, a config no key for it: "
+                                          "a class of your own can set it (learner.import). Allowed here: "),
+        ("{kind: dqn, train_freq: 4}", "What Stable-Baselines3 calls train_freq is learner.n_steps or learner.n_epi"),
+        ("{kind: ppo, seed: 4}", "learner.seed: unknown key: seed stands outside of learner"),
+        ("{kind: ppo, import: 'a:B', target: 1}", ". What a learner of your own takes stands in kwargs: {'target': 1}"),
+        ("{kind: ppo, kwargs: {target_kl: 1}}", "it names none; 'target_kl' stands beside kwargs: learner.target_kl"),
+        ("{kind: ppo, kwargs: {target_klx: 1}}", "it names none; did you mean 'target_kl'? That stands beside kwargs: "
+                                                 "learner.target_kl"),
+        ("{import: 'a:B'}", "learner.kind: this key is required: beside import it says which of Stable-Baselines3's "
+                            "classes yours is derived from. Allowed: ppo, trpo, a2c"),
+    ],
+)  # fmt: skip
+def test_a_learners_arguments_are_told_where_they_belong(learner: str, said: str) -> None:
+    assert said in refusal(SPACE, f"learner={learner}")
+
+
 def test_an_unknown_key_inside_an_unknown_section_is_put_down_to_its_override() -> None:
     assert refusal(SPACE, "budjet.steps=1").startswith("--set budjet.steps=1: budjet: unknown key")
     assert refusal(SPACE, "seed.x=1").startswith("--set seed.x=1: ")
@@ -323,6 +346,63 @@ def test_unknown_kinds_list_what_is_known() -> None:
 def test_empty_sections_are_told_what_they_need(key: str, value: str, said: str, tmp_path: Path) -> None:
     path = written(tmp_path, replaced(plain(SPACE), key, Raw(value)))
     assert f"{path}: {said}" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("name", "give it a text"),
+        ("seed", "give it a whole number from 0 to 2,147,483,647, or leave the key out"),
+        ("engine", "give it auto, single or population, or leave the key out"),
+        ("env.context_visible", "give it true or false, or leave the key out"),
+        ("instances.test", "give it a path"),
+        ("curriculum.eta", "give it a number above 0, or leave the key out"),
+        ("learner.gamma", "give it a number from 0 to 1, or leave the key out"),
+        ("learner.net_arch", "give it a list, [] for none, or leave the key out"),
+        ("rollout.slots", "give it a whole number from 1 to 65,536, or leave the key out"),
+        ("budget.steps", "give it a whole number from 1 to 1,000,000,000,000"),
+        ("evaluation.every_steps", "give it a whole number or log, or leave the key out"),
+        ("env.kwargs.horizon", "give it true or false, a number, or a text, or leave it out"),
+    ],
+)
+def test_empty_values_are_told_what_they_need(key: str, said: str) -> None:
+    assert refusal(SPACE, f"{key}=") == f"--set {key}=: {key}: is empty; {said}"
+
+
+def test_no_empty_value_is_told_in_pydantics_words() -> None:
+    """Of no key of any section, whichever kind it is of, nor in lists and by names of a user's own."""
+    data = configs.read(SPACE)
+    sections = [
+        (name, model, key)
+        for name, field in configs.RunConfig.model_fields.items()
+        for model in (field.annotation, *get_args(field.annotation)) if isinstance(model, type)
+        and issubclass(model, configs.Section)
+        for key in model.model_fields
+    ]  # fmt: skip
+    assert len(sections) > 200
+    empty: list[dict[str, Any]] = [{name: None} for name in configs.RunConfig.model_fields]
+    for name, model, key in sections:
+        kind = {"kind": get_args(model.model_fields["kind"].annotation)[0]} if "kind" in model.model_fields else {}
+        section = {**(kind or data.get(name, {})), model.model_fields[key].alias or key: None}
+        empty.append({name: [section] if name == "schedule" else section})
+    empty += [{"schedule": [{"steps": 5000, "set": {key: None}}]} for key in ("learner.gamma", "curriculum")]
+    empty += [{"learner": {"kind": "ppo", "net_arch": [None]}}, {"tracking": {"sinks": [None]}}]
+    said = []
+    for change in empty:
+        try:
+            configs.parse({**data, **change}, "run.yaml")
+        except ConfigError as error:
+            said += str(error).splitlines()
+    assert len(said) > 200
+    assert [line for line in said if re.search(r"Input|None|a value", line)] == []
+
+
+def test_values_of_no_type_that_a_key_may_have_are_told_all_of_them() -> None:
+    assert refusal(SPACE, "evaluation.every_steps=1.5").endswith("must be a whole number or log, not 1.5")
+    text = refusal(SPACE, "checkpoint.every_rounds=atuo")
+    assert text.endswith("checkpoint.every_rounds: must be a whole number or auto, not 'atuo'; did you mean 'auto'?")
+    assert refusal(SPACE, "env.kwargs={a: [1]}").endswith("env.kwargs.a: must be true or false, a number, or a text, "
+                                                          "not [1]")  # fmt: skip
 
 
 def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:

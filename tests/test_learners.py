@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from stable_baselines3.sac.policies import SACPolicy  # noqa: F401 - named by im
 
 from space_dist import config as configs
 from space_dist.config import RunConfig
+from space_dist.config.explaining import NOT_HERE, SET_BY_OWN_CLASS
 from space_dist.envs.observations import Observations, rows
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError
 from space_dist.learner import make_learner
-from space_dist.learner.networks import TorchPolicy
+from space_dist.learner.networks import ALGORITHMS, TorchPolicy
 from space_dist.learner.recurrent import RecurrentTorchPolicy
 from space_dist.ledger import CURRICULUM, FORMAT, METRICS, Ledger, RunWriter, decode_checkpoint
 from space_dist.report import build_report, load_run
@@ -598,3 +600,12 @@ def test_rounds_collected_ahead_by_actors_are_the_same(tmp_path: Path) -> None:
     config = config_for(tmp_path, learner_section("ppo"), rollout=rollout, curriculum={"kind": "round_robin"})
     there = config.model_copy(update={"resources": config.resources.model_copy(update={"workers": 2})})
     assert run(there, tmp_path / "actors") == run(config, tmp_path / "here")
+
+
+def test_every_argument_of_stable_baselines3s_classes_has_a_key_or_is_told_why_not() -> None:
+    elsewhere = {"self", "env", "seed", "device", "verbose", "stats_window_size", "_init_setup_model"}
+    for section in get_args(get_args(configs.LearnerConfig)[0]):
+        (kind,) = get_args(section.model_fields["kind"].annotation)
+        told = {name for name, kinds in SET_BY_OWN_CLASS.items() if kind in kinds} | {*NOT_HERE}
+        for name in inspect.signature(ALGORITHMS[kind].__init__).parameters.keys() - elsewhere:
+            assert name in section.model_fields or name in told or configs.what_sb3_calls(name), (kind, name)

@@ -104,7 +104,11 @@ def test_what_cannot_be_made_is_refused_before_the_run(curriculum: str, words: s
         ('import: "space_dist.curricula:RoundRobin"', "'space_dist.curricula' is a module of space_dist itself"),
         ("kwargs: {share: 1}", "curriculum.import: this key is required"),
         ('import: "a:B", import_path: "a:B"', "curriculum.import_path: unknown key; did you mean 'import'?"),
-        ('import: "a:B", kwargs: {share: [1]}', "curriculum.kwargs: [1]: "),
+        (
+            'import: "a:B", kwargs: {share: [1]}',
+            "curriculum.kwargs.share: must be true or false, a number, or a text, not [1]",
+        ),
+        ('import: "a:B", kwargs: {share: }', "curriculum.kwargs.share: is empty; give it true or false, a number, or"),
     ],
 )
 @pytest.mark.usefixtures("example")
@@ -112,6 +116,21 @@ def test_what_a_config_may_not_say_is_refused(curriculum: str, words: str) -> No
     with pytest.raises(ConfigError) as refusal:
         chosen(f"curriculum={{kind: custom, {curriculum}}}")
     assert words in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("", "curriculum.kind: this key is required: a"),
+        ("kind: mine, ", "curriculum.kind: 'mine' is not known: a"),
+        ("kind: space, ", "curriculum.import: unknown key; a"),
+    ],
+)
+@pytest.mark.usefixtures("example")
+def test_import_without_its_kind_is_told_which_that_is(kind: str, words: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        chosen(f'curriculum={{{kind}import: "a:B"}}')
+    assert str(refusal.value).endswith(f"{words} curriculum of your own, which import names, has `kind: custom`")
 
 
 def test_an_answer_that_breaks_the_protocol_ends_the_run_with_a_sentence(example: Path) -> None:

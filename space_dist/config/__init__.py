@@ -5,7 +5,8 @@
     run                                      a whole config, and what its sections must agree about
     curriculum, learner, sections            its sections
     shipped                                  what comes with the package
-    plain_yaml, tracking_uri, quoting        what is not about runs
+    plain_yaml, tracking_uri                 what is not about runs
+    wanted, quoting                          values, and types, in sentences
 
 Each imports from those below it.
 """

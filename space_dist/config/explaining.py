@@ -7,15 +7,17 @@ import keyword
 import re
 import types
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
 from space_dist.config.curriculum import CustomConfig
+from space_dist.config.learner import LearnerSection
 from space_dist.config.quoting import short
 from space_dist.config.run import RunConfig
-from space_dist.config.sections import EnvConfig
+from space_dist.config.sections import CurriculumSection, EnvConfig
 from space_dist.config.tracking_uri import UriError
+from space_dist.config.wanted import is_choice, item_of, wanted, words_of
 from space_dist.errors import nearest, with_changes
 
 # What scripts with SB3 say, and where a config says it.
@@ -37,9 +39,25 @@ _SB3_NAMES = {
     "norm_obs": "learner.normalize_observations",
     "norm_reward": "learner.normalize_rewards",
     "save_freq": "checkpoint.every_rounds",
+    "train_freq": "learner.n_steps or learner.n_episodes",
+    "gradient_steps": "learner.gradient_steps_per_step",
+    "action_noise": "learner.action_noise_std (of td3)",
 }
 
+SET_BY_OWN_CLASS = {
+    "clip_range_vf": ("ppo", "recurrent_ppo"), "sub_sampling_factor": ("trpo",), "target_entropy": ("sac",),
+}  # fmt: skip
+"""Stable-Baselines3's arguments that have no key, and that a class of one's own can set: the kinds that have each."""
+NOT_HERE = (
+    "use_sde", "sde_sample_freq", "use_sde_at_warmup", "rollout_buffer_class", "rollout_buffer_kwargs",
+    "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage",
+)  # fmt: skip
+"""Stable-Baselines3's arguments that a run cannot have."""
+
 _TAKES_KWARGS = {EnvConfig: "the environment", CustomConfig: "a curriculum of your own"}
+_CUSTOM = "custom"
+_OWN_CURRICULUM = f"a curriculum of your own, which import names, has `kind: {_CUSTOM}`"
+_OF_ANOTHER_TYPE = ("literal_error", "int_from_float", "finite_number")  # beside bool_type, int_type, ...
 
 
 def schema(of: type[BaseModel] = RunConfig) -> Iterator[tuple[str, str, str, str]]:
@@ -87,12 +105,15 @@ def _in_words(annotation: Any) -> str:
     return {types.NoneType: "null", Any: "any"}.get(annotation) or str(annotation.__name__)
 
 
-def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str, str]) -> str:
+def explain(
+    fault: Any, root: type[BaseModel], source: str, origins: Mapping[str, str], data: Mapping[str, Any]
+) -> str:  # fmt: skip
     """A fault that pydantic found in a config of the schema `root`: where it lies, what it is, and what is allowed.
 
-    fault: one of `ValidationError.errors()`. source: the file. origins: which keys came from elsewhere.
+    fault: one of `ValidationError.errors()`. source: the file. origins: which keys came from elsewhere. data: all that
+    was checked.
     """
-    path, model = _locate(fault["loc"], root)
+    path, model, field, value = _locate(fault["loc"], root)
     # Pydantic places a tag's fault at the section; the key that people wrote is its `kind`.
     if fault["type"].startswith("union_tag"):
         path.append("kind")
@@ -107,11 +128,10 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     if where == source and kind in ("extra_forbidden", "missing") and (of_kind := origins.get(f"{path[0]}.kind")):
         where = f"{source} with {of_kind}"  # by which the section has other keys than the file's
     if kind == "extra_forbidden":
-        told = f"{where}: {key}: unknown key{_what_is_known(path, model, root, given)}"
+        told = f"{where}: {key}: unknown key{_what_is_known(path, model, root, given, data)}"
         if where.startswith(f"{source} with "):  # what the file says of another kind
             return f"{told}. `--set '{path[0]}={{kind: NAME}}'` puts another section in place of the file's"
         return told
-    field = _field(model, path[-1]) if model and path else None
     options = _sections(field) if field else []
     if kind == "missing":
         way_out = f"; `space-dist config schema {path[-1]}` explains it" if root is RunConfig else ""
@@ -123,18 +143,9 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         # An item of a list, or what a user's own name stands for, is no field: then the model is its own.
         named = [one for one in (*options, model) if one and one.__name__ == context.get("class_name")]
         return f"{where}: {key or 'the whole file'}: {_no_section(given, named or options)}"
-    if given is None and kind in ("dict_type", "tuple_type"):
-        may_be_empty = field is not None and not any(getattr(limit, "min_length", 0) for limit in field.metadata)
-        what = "keys and values" if kind == "dict_type" else "a list, [] for none" if may_be_empty else "a list"
-        way_out = "" if field and field.is_required() else ", or leave the key out"
-        return f"{where}: {key}: is empty; give it {what}{way_out}"
-    if kind in ("union_tag_invalid", "union_tag_not_found"):
+    if kind.startswith("union_tag"):
         tags = [tag.strip("' ") for tag in str(context.get("expected_tags") or _tags(path[0])).split(",")]
-        given_kind = given.get("kind") if isinstance(given, dict) else given
-        if given_kind is None:
-            return f"{where}: {key}: this key is required. Allowed: {', '.join(tags)}"
-        hint = nearest(str(given_kind), tags)
-        return f"{where}: {key}: {short(given_kind)} is not known{hint} Allowed: {', '.join(tags)}"
+        return f"{where}: {key}: {_no_kind(given, tags)}"
     if kind == "value_error":
         message = str(context.get("error", fault["msg"]))
         if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
@@ -149,6 +160,11 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
         if isinstance(context.get("error"), UriError):
             return f"{where}: {key}: {message}"
         return f"{where}: {key}: {message}, not {short(given)}"
+    if given is None:
+        return f"{where}: {key}: is empty; give it {_what_to_give(field, value, fault)}"
+    if is_choice(value) and (kind.endswith("_type") or kind in _OF_ANOTHER_TYPE):
+        hint = nearest(given, words_of(value)).removesuffix(".") if isinstance(given, str) else ""
+        return f"{where}: {key}: must be {wanted(value)}, not {short(given)}{hint}"
     if kind == "literal_error" and isinstance(given, str):
         words = re.findall(r"'([^']+)'", str(context.get("expected")))
         return f"{where}: {key}: {short(given)} is not known{nearest(given, words)} Allowed: {', '.join(words)}"
@@ -157,22 +173,73 @@ def explain(fault: Any, root: type[BaseModel], source: str, origins: Mapping[str
     return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
 
 
-def _what_is_known(path: list[str], model: type[BaseModel] | None, root: type[BaseModel], given: object) -> str:
+def _what_to_give(field: Any, value: Any, fault: Any) -> str:
+    """What to write in place of nothing. field: of the key that is empty; None for what stands in a list or by name."""
+    if field is None:
+        return f"{wanted(value)}, or leave it out"
+    what = wanted(value, field.metadata)
+    if fault["type"] == "tuple_type" and not any(getattr(limit, "min_length", 0) for limit in field.metadata):
+        what += ", [] for none"
+    return what if field.is_required() else f"{what}, or leave the key out"
+
+
+def _no_kind(given: object, tags: list[str]) -> str:
+    """What to say of a section whose kind is missing, or not known. tags: those that are."""
+    kind = given.get("kind") if isinstance(given, Mapping) else given
+    what = "this key is required" if kind is None else f"{short(kind)} is not known"
+    allowed = f"Allowed: {', '.join(tags)}"
+    if isinstance(given, Mapping) and given.get("import") is not None:
+        if _CUSTOM in tags:
+            return f"{what}: {_OWN_CURRICULUM}"
+        return f"{what}: beside import it says which of Stable-Baselines3's classes yours is derived from. {allowed}"
+    return f"{what}. {allowed}" if kind is None else f"{what}{nearest(str(kind), tags)} {allowed}"
+
+
+def _what_is_known(
+    path: list[str], model: type[BaseModel] | None, root: type[BaseModel], given: object, data: Mapping[str, Any]
+) -> str:
     """What to say of a key that a file may not have, behind "unknown key". model: the section that it stands in."""
     key = path[-1]
+    if key == "import" and model is not None and issubclass(model, CurriculumSection):
+        return f"; {_OWN_CURRICULUM}"
     if root is RunConfig and (meant := what_sb3_calls(key)) is not None:
         return f". {meant}"
     if root is RunConfig and len(path) == 1 and (sections := _sections_with(key)):
         return f"; keys stand in sections: {' or '.join(f'{section}.{key}' for section in sections)}"
+    if root is RunConfig and len(path) > 1 and key in RunConfig.model_fields:
+        return f": {key} stands outside of {path[0]}"
     allowed = _names(model) if model else []
-    hint = nearest(key, allowed)
+    of_sb3 = _of_sb3_alone(path, data)
+    hint = "." if key in of_sb3 else nearest(key, [*allowed, *of_sb3])
     if hint == "." and root is RunConfig and len(path) == 1:  # misspelt, and without its section
         below = {name: f"{section}.{name}" for section in allowed for name in _names_below(section)}
         close = nearest(key, below)
         hint = next((f"; did you mean {whole!r}?" for name, whole in below.items() if f" {name!r}?" in close), hint)
-    taker = _TAKES_KWARGS.get(model) if model and isinstance(given, bool | int | float | str) else None
+    told = next((said for name, said in of_sb3.items() if key == name or f" {name!r}?" in hint), "")
+    if told:
+        return f"{hint} {told}. Allowed here: {', '.join(allowed)}"
+    taker = _taker(model, data.get(path[0])) if isinstance(given, bool | int | float | str) else None
     way_out = "" if taker is None else f". What {taker} takes stands in kwargs: {short({key: given})}"
     return f"{hint} Allowed here: {', '.join(allowed)}{way_out}"
+
+
+def _of_sb3_alone(path: list[str], data: Mapping[str, Any]) -> dict[str, str]:
+    """Arguments of Stable-Baselines3's that have no key beside a key of a learner's, and what to say of each."""
+    section = data.get(path[0])
+    if path[:-1] != ["learner"] or not isinstance(section, Mapping):
+        return {}
+    kind = section.get("kind")
+    own = f"Stable-Baselines3's {kind} has it, a config no key for it: a class of your own can set it (learner.import)"
+    settable = {name: own for name, kinds in SET_BY_OWN_CLASS.items() if kind in kinds}
+    return settable | dict.fromkeys(NOT_HERE, "Stable-Baselines3 has it, and runs here do without")
+
+
+def _taker(model: type[BaseModel] | None, section: object) -> str | None:
+    """What takes the kwargs of a section; None for one that has none."""
+    if model is not None and issubclass(model, LearnerSection):
+        has_own = isinstance(section, Mapping) and section.get("import") is not None
+        return "a learner of your own" if has_own else None
+    return _TAKES_KWARGS.get(model) if model else None
 
 
 def _no_section(given: object, options: list[type[BaseModel]]) -> str:
@@ -233,9 +300,21 @@ def _tags(key: str) -> str:
     return ", ".join(_kinds(_models(RunConfig.model_fields[key])))
 
 
-def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[list[str], type[BaseModel] | None]:
-    """Pydantic's location without the tags of unions, and the section it lies in."""
+class _Place(NamedTuple):
+    path: list[str]
+    """Pydantic's location, without the tags of unions."""
+    model: type[BaseModel] | None
+    """The section it lies in."""
+    field: Any
+    """What lies there; None for what is no key but stands in a list, or behind a user's own name."""
+    value: Any
+    """Its type."""
+
+
+def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> _Place:
     path: list[str] = []
+    field: Any = None
+    value: Any = None
     model: type[BaseModel] | None = root
     options: list[type[BaseModel]] = []
     # What each item of a list, or of a user's own names, stands for, where the next part is one.
@@ -247,23 +326,27 @@ def _locate(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[lis
             continue
         if named is not None:
             path.append(str(part))
-            model, named = named, None
+            model, named, field = named, None, None
             continue
         tagged = [option for option in options if get_args(option.model_fields["kind"].annotation)[0] == part]
         if tagged:
             model, options = tagged[0], []
             continue
         if isinstance(part, str) and model is None:
-            continue  # the name pydantic gives to one alternative of a value, like int or literal['log']
+            if get_origin(value) is dict:  # a user's own name
+                path.append(part)
+                field, value = None, item_of(value)
+            continue  # or the name pydantic gives to one alternative of a value, like int or literal['log']
         path.append(str(part))
-        field = model.model_fields.get(str(part)) if model else None
+        field = _field(model, str(part)) if model else None
+        value = field.annotation if field else item_of(value)
         inner = _models(field) if field else []
         if field is not None and part != location[-1]:
             model = inner[0] if len(inner) == 1 else None
             alternative = model is not None and len(_annotations(field).keys() - {types.NoneType}) > 1
             options = inner if len(inner) > 1 else []
             named = next(iter(_items(field)), None) or _by_name(field)
-    return path, model
+    return _Place(path, model, field, value)
 
 
 def _items(field: Any) -> list[type[BaseModel]]:

@@ -10,7 +10,9 @@ from space_dist.config.sections import Section, own_path, refuse_library
 from space_dist.errors import nearest
 
 
-class _Learner(Section):
+class LearnerSection(Section):
+    """What all learners have in common."""
+
     has_advantages: ClassVar[bool] = False
     """Whether an update tells the advantages of the transitions it is made of."""
     keeps_next_observations: ClassVar[bool] = False
@@ -93,11 +95,23 @@ class _Learner(Section):
         if self.import_path is not None and getattr(self, "update", "stock") == "lean":
             raise ValueError("update: lean is Stable-Baselines3's update, compiled; with import it must be stock")
         if self.import_path is None and self.kwargs:
-            raise ValueError("kwargs are arguments of your own class, which import names; it names none")
+            raise ValueError(
+                f"kwargs are arguments of your own class, which import names; it names none{self._beside_kwargs()}"
+            )
         return self
 
+    def _beside_kwargs(self) -> str:
+        """Where the first of its kwargs that is a key of its own stands, or resembles one; empty for none."""
+        keys = type(self).model_fields
+        for name in self.kwargs:
+            hint = nearest(name, keys)
+            if (key := next((one for one in keys if f" {one!r}?" in hint), None)) is not None:
+                asked = "" if key == name else f"{hint} That"
+                return f"{asked or f'; {name!r}'} stands beside kwargs: learner.{key}"
+        return ""
 
-class _OnPolicy(_Learner):
+
+class _OnPolicy(LearnerSection):
     has_advantages: ClassVar[bool] = True
 
     n_steps: int = Field(default=2048, ge=2)
@@ -115,7 +129,7 @@ class _OnPolicy(_Learner):
     """Natural logarithm of the initial standard deviation of continuous actions, in action units. Source: SB3."""
 
     def policy_settings(self) -> dict[str, Any]:
-        """See `_Learner`."""
+        """See `LearnerSection`."""
         return {"log_std_init": self.log_std_init}
 
 
@@ -153,7 +167,7 @@ class PPOConfig(_Clipped):
     of what a run is."""
 
     def is_compiled(self, engine: str) -> bool:
-        """See `_Learner`."""
+        """See `LearnerSection`."""
         return engine == "population" or self.update == "lean"
 
 
@@ -199,11 +213,11 @@ class RecurrentPPOConfig(_Clipped):
 
     @property
     def memory_size(self) -> int:
-        """See `_Learner`: hidden and cell state of each layer, of the actor's LSTM and of the critic's own."""
+        """See `LearnerSection`: hidden and cell state of each layer, of the actor's LSTM and of the critic's own."""
         return (4 if self.enable_critic_lstm else 2) * self.n_lstm_layers * self.lstm_hidden_size
 
     def policy_settings(self) -> dict[str, Any]:
-        """See `_Learner`."""
+        """See `LearnerSection`."""
         return {
             **super().policy_settings(), "lstm_hidden_size": self.lstm_hidden_size,
             "n_lstm_layers": self.n_lstm_layers, "shared_lstm": self.shared_lstm,
@@ -256,7 +270,7 @@ class A2CConfig(_OnPolicy):
     """Epsilon of RMSProp. Source: SB3."""
 
 
-class _OffPolicy(_Learner):
+class _OffPolicy(LearnerSection):
     keeps_next_observations: ClassVar[bool] = True
 
     n_steps: int = Field(default=512, ge=1)
@@ -285,11 +299,11 @@ class _OffPolicy(_Learner):
 
     @property
     def episodes_per_round(self) -> int | None:
-        """See `_Learner`."""
+        """See `LearnerSection`."""
         return self.n_episodes
 
     def is_compiled(self, engine: str) -> bool:  # noqa: ARG002 - there are no populations of these
-        """See `_Learner`."""
+        """See `LearnerSection`."""
         return self.update == "lean"
 
 
@@ -374,6 +388,6 @@ LearnerConfig = Annotated[
 
 def learners_that(ability: Literal["has_advantages", "keeps_next_observations", "can_be_stacked"]) -> list[str]:
     """The kinds of learners that can do something, for sentences."""
-    sections: tuple[type[_Learner], ...] = get_args(get_args(LearnerConfig)[0])
+    sections: tuple[type[LearnerSection], ...] = get_args(get_args(LearnerConfig)[0])
     able = (section for section in sections if getattr(section, ability))
     return [get_args(section.model_fields["kind"].annotation)[0] for section in able]

@@ -96,7 +96,7 @@ def check(model: type[_M], data: Mapping[str, Any], source: str, origins: Mappin
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        faults = [explain(fault, model, source, origins or {}) for fault in error.errors(include_url=False)[:10]]
+        faults = [explain(fault, model, source, origins or {}, data) for fault in error.errors(include_url=False)[:10]]
         raise ConfigError("\n".join(dict.fromkeys(faults))) from None
 
 

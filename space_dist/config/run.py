@@ -23,6 +23,7 @@ from space_dist.config.sections import (
     Section,
     TrackingConfig,
 )
+from space_dist.config.wanted import wanted
 from space_dist.errors import nearest
 
 CHANGEABLE: Final = (
@@ -224,6 +225,10 @@ class RunConfig(Section):
                 fault = error.errors(include_url=False)[0]
                 where = ".".join(str(part) for part in fault["loc"] if part not in (self.learner.kind,))
                 what = fault["msg"]
+                if fault["input"] is None:
+                    section = getattr(self, str(fault["loc"][0]))
+                    key = type(section).model_fields.get(str(fault["loc"][-1]))
+                    what = f"is empty; give it {wanted(key.annotation, key.metadata) if key else 'keys and values'}"
                 if fault["type"] == "union_tag_invalid":
                     known = re.findall(r"'(\w+)'", str(fault["ctx"]["expected_tags"]))
                     tag = str(fault["ctx"]["tag"])
