@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import html
 import importlib.util
 import json
 import os
@@ -38,8 +39,12 @@ from space_dist.experiment.tuning import TuneConfig, is_search
 from space_dist.grid.forking import change_of
 from space_dist.slurm.profile import load_profile
 from tests.commanding import command
+from tests.grids import ROOT
 
-ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "jobs"))
+
+from site_docstrings import as_lists
+
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -132,6 +137,26 @@ def test_files_outside_of_docs_are_pages(site: Path) -> None:
     assert "highlight" in shown
     assert "space.py.html" in (site / "source/space_dist/curricula/index.html").read_text()
     assert 'href="source/space_dist/curricula/space.py.html"' in (site / "architecture.html").read_text()
+
+
+def test_arguments_and_fields_are_lists_on_the_page_of_the_api(site: Path) -> None:
+    text = html.unescape(re.sub(r"<(?!/?(?:li|p)\b)[^>]+>", "", (site / "api.html").read_text()))
+    for item in ("seed, workers: the run's seed,", "out: the run's folder;", "resume: go on with", "n_envs: how many"):
+        assert f"<li>{item}" in text
+    assert "<p>Raises LedgerError where there is no policy yet," in text
+
+
+def test_a_list_has_what_is_told_of_names_and_nothing_else() -> None:
+    told = (
+        "First: a line.\n\nBefore them. seed: of draws; None: none.  out,\nroot: where seed: is.  size: two\n"
+        "    lines. Raises OSError.\n\n    seed: code"
+    )
+    assert as_lists(told, ["seed", "size"]) == (
+        "First: a line.\n\nBefore them.\n\n- **`seed`**: of draws; None: none.  out, root: where seed: is.\n"
+        "- **`size`**: two lines.\n\nRaises OSError.\n\n    seed: code"
+    )
+    assert as_lists("seed, out: these.", ["seed", "out"]) == "- **`seed`**, **`out`**: these."
+    assert as_lists("Nothing: no name.\nAnother line.", ["seed"]) == "Nothing: no name.\nAnother line."
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
