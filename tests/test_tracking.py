@@ -264,7 +264,9 @@ def test_what_mlflow_refuses_of_one_run_does_not_stop_the_others(uri: str, tmp_p
 def test_a_dead_server_costs_nothing(tmp_path: Path) -> None:
     ledger = finished_run(tmp_path / "run", 1.0)
     before = contents(tmp_path)
-    with pytest.raises(TrackingError, match=r"http://127\.0\.0\.1:9 cannot be written to.*Nothing is lost"):
+    with pytest.raises(
+        TrackingError, match=r"http://127\.0\.0\.1:9 cannot be written to: Connection refused\. Nothing is lost"
+    ):
         sync([ledger], "http://127.0.0.1:9", "tests")
     assert contents(tmp_path) == before
 

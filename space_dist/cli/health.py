@@ -25,6 +25,7 @@ _NEEDED: Final = (
 )  # fmt: skip
 _LEAST_MB, _LEAST_FREE_MB = 2000, 1000  # of memory for a run with a Ray of its own; of disk for its files
 _NO_ANSWER = "no answer within"
+_LONGEST: Final = 120  # characters of a cause, so that its line is read at a glance
 _SECONDS: Final = {"import": 60.0, "ray": 120.0, "command": 10.0, "server": 30.0}  # before a check is given up
 _START_RAY: Final = """
 from space_dist.system.workplace import private_ray
@@ -209,7 +210,7 @@ def _store_of_environment(*, ask: bool) -> Iterator[Finding]:
     elif ask:
         why = _failure(_ASK_MLFLOW, "server")
         yield Finding("ok", f"{URI_VARIABLE}: an MLflow answers at {parts.netloc}") if why is None else Finding(
-            "broken", f"{URI_VARIABLE}: no MLflow answers at {parts.netloc}: {_sentence(why)}",
+            "broken", f"{URI_VARIABLE}: no MLflow answers at {parts.netloc}: {_cause(why)}",
             f"start the server, or unset {URI_VARIABLE}; nothing of a run is lost meanwhile (space-dist sync)",
         )  # fmt: skip
 
@@ -249,9 +250,11 @@ def slurm_here() -> Iterator[Finding]:
             return
 
 
-def _sentence(why: str) -> str:
-    """The first sentence of what an exception of ours says."""
-    return why.partition("Error: ")[2].partition(". ")[0] or why
+def _cause(why: str) -> str:
+    """What the first sentence of an exception of ours gives as the reason, behind whose store it is."""
+    sentence = why.partition("Error: ")[2].partition(". ")[0] or why
+    cause = sentence.partition(" cannot be written to: ")[2] or sentence
+    return cause if len(cause) <= _LONGEST else f"{cause[:_LONGEST]}..."
 
 
 def _noted_unless(fine: bool, what: str, otherwise: str, mend: str) -> Finding:

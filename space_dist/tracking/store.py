@@ -457,9 +457,25 @@ def store_errors(uri: str) -> Iterator[None]:
 
 def _unreachable(uri: str, error: Exception) -> TrackingError:
     return TrackingError(
-        f"MLflow at {uri} cannot be written to: {_first_line(error)}. Nothing is lost: the ledgers are complete, and "
-        "`space-dist sync` replays them once it works again"
+        f"MLflow at {uri} cannot be written to: {_of_network(error) or _first_line(error)}. Nothing is lost: the "
+        "ledgers are complete, and `space-dist sync` replays them once it works again"
     )
+
+
+def _of_network(error: BaseException | None) -> str:
+    """Why no answer came, as the system puts it (`Connection refused`); empty for anything else.
+
+    MLflow's own sentence begins with what was asked of whom, twice, and is cut before it comes to that.
+    """
+    from requests import RequestException
+
+    requested, cause = False, ""
+    while error is not None:
+        requested = requested or isinstance(error, RequestException)
+        if isinstance(error, TimeoutError) or (isinstance(error, OSError) and error.strerror):
+            cause = error.strerror or str(error)  # that of a socket is "timed out", without a number
+        error = error.__cause__ or error.__context__
+    return cause if requested else ""
 
 
 def _first_line(error: Exception) -> str:
