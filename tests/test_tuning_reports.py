@@ -237,6 +237,23 @@ def test_a_search_without_a_cell_can_be_looked_at(
     assert len(search_of(after).open) == 4
 
 
+def test_no_number_of_a_setting_is_broken_whatever_the_width(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    named = "learning_progress_with_a_name_of_some_length"
+    arms = {"space": {"set": {"curriculum": {"kind": "space"}}}, named: {"set": {"curriculum": {"kind": "space"}}}}
+    path = write_tune(tmp_path, arms=arms, generation=1)
+    for columns in (80, 200):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert command(monkeypatch, "tune", "plan", path, "--root", tmp_path / str(columns)) == 0
+        told = capsys.readouterr().out
+        rates = [trial.parameters["learner.learning_rate"]
+                 for trial in search_of(Grid(tmp_path / f"{columns}/search").manifest()).trials]  # fmt: skip
+        assert all(re.search(rf"learning_rate={rate}\b", told) for rate in rates)
+        in_lines = f"{named}, trial 0\n  state open, seeds 3\n  learning_rate="
+        assert (in_lines in told) == (columns == 80)
+
+
 def _refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], what: str, path: Path, root: Path
 ) -> str:

@@ -126,6 +126,11 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
     return table
 
 
+def fits(table: Table) -> bool:
+    """Whether a terminal of this width shows a table without breaking anything in it."""
+    return console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum <= console.width
+
+
 def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
     """How the seeds of each cell stand: a line for each, and a label's whole words, whatever the terminal's width."""
     of_cell: dict[str, list[RunStatus]] = {cell.id: [] for cell in manifest.cells}
@@ -140,7 +145,7 @@ def print_cells(manifest: Manifest, found: Sequence[RunStatus]) -> None:
         table.add_column(column, justify="left" if column in ("cell", "id") else "right", no_wrap=True)
     for row in rows:
         table.add_row(*map(Text, row.values()))
-    if console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum <= console.width:
+    if fits(table):
         console.print(table)
         return
     say(manifest.name)

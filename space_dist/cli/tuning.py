@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -28,7 +29,7 @@ from space_dist.cli.grids import (
     started_ahead,
     tell_results_elsewhere,
 )
-from space_dist.cli.overview import Watching, display, print_failures, summary, workers_in_words
+from space_dist.cli.overview import Watching, display, fits, print_failures, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
 from space_dist.errors import ConfigError
 from space_dist.system.extras import needed_from
@@ -235,7 +236,10 @@ def _summary(manifest: Manifest, search: Search) -> str:
 
 
 def _print_trials(search: Search, cells: list[str]) -> None:
-    """How the trials of each arm stand, and what those of these cells are; what they reached is the report's."""
+    """How the trials of each arm stand, and what those of these cells are; what they reached is the report's.
+
+    Where the table is wider than the terminal, it is told in lines: no number is broken.
+    """
     rows = [
         {
             "arm": trial.arm, "trial": str(trial.number), "from": str(trial.parent) if trial.parent >= 0 else "",
@@ -246,14 +250,26 @@ def _print_trials(search: Search, cells: list[str]) -> None:
     ]  # fmt: skip
     # Of whom it is a copy, and where its runs are paused, is told where there is any such trial.
     told = [key for key in (rows[0] if rows else ()) if any(row[key] for row in rows)]
-    table = Table(title_justify="left", box=box.SIMPLE)  # numbers are read whole at 80 columns
+    table = Table(box=box.SIMPLE)
     for column in told:
         is_number = column in ("trial", "from", "seeds", "steps")
-        table.add_column(column, justify="right" if is_number else "left", overflow="fold")
+        table.add_column(column, justify="right" if is_number else "left", no_wrap=True)
     for row in rows:
         table.add_row(*(Text(row[column]) for column in told))
-    if rows:
+    if rows and fits(table):
         console.print(table)
+    else:
+        for row in rows:
+            _print_in_lines(row)
+
+
+def _print_in_lines(trial: Mapping[str, str]) -> None:
+    say(f"{trial['arm']}, trial {trial['trial']}")
+    say(
+        "  " + ", ".join(f"{column} {trial[column]}" for column in ("from", "state", "seeds", "steps") if trial[column])
+    )
+    for setting in trial["setting"].splitlines():
+        say(f"  {setting}")
 
 
 def _print_failed(search: Search) -> None:
