@@ -466,11 +466,18 @@ def test_a_module_that_no_job_would_find_is_told(
     (line,) = re.findall(r"into the profile, (env: .+}), and export again; or install it", without)
     (tmp_path / "site.yaml").write_text(f"{line}\n")
     assert load_profile(tmp_path / "site.yaml").env == {"PYTHONPATH": str(mine)}
-    readme = (tmp_path / "out/README.md").read_text()
-    assert "Not in this folder is code of your own that runs import: slider." in readme
-    assert "imports" not in told("--profile", tmp_path / "site.yaml")
-    assert "imports" not in told("--profile", mine / "slurm.yaml")
-    assert "imports" not in told("--set", "prologue=[export PYTHONPATH=/mine]")
+    readme, advice = tmp_path / "out/README.md", "`env: {PYTHONPATH: /FOLDER}`.\n\n```bash"
+    assert "Not in this folder is code of your own that runs import: slider. The nodes must" in readme.read_text()
+    assert advice in readme.read_text()
+    for words in (
+        ("--profile", tmp_path / "site.yaml"), ("--profile", mine / "slurm.yaml"),
+        ("--set", "prologue=[export PYTHONPATH=/mine]"),
+    ):  # fmt: skip
+        assert "imports" not in told(*words)
+        assert (
+            "slider. All nodes must see\nthe folder of it that the profile's PYTHONPATH names.\n\n```bash"
+            in readme.read_text()
+        )
     said = told("--set", f"env.PYTHONPATH={tmp_path}")  # where it is not
     assert f"{json.dumps(f'{tmp_path}:{mine}', ensure_ascii=False)}}}, and export" in said
     said = told("--set", "env.PYTHONPATH=/of/the/cluster")

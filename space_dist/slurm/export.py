@@ -118,9 +118,18 @@ class Export:
         found = (configs.parse(cell.config, f"cell {cell.id}").import_paths for cell in self.manifest.cells)
         return sorted({path.partition(":")[0].partition(".")[0] for paths in found for path in paths})
 
+    @property
+    def _prologue_sets_path(self) -> bool:
+        return any("PYTHONPATH" in line for line in self.profile.prologue)
+
+    @property
+    def sets_path(self) -> bool:
+        """Whether the profile says itself where jobs find modules."""
+        return bool(self.profile.env.get("PYTHONPATH")) or self._prologue_sets_path
+
     def import_remark(self) -> str | None:
         """What is to be known of modules that this machine finds only here, and jobs maybe nowhere."""
-        if any("PYTHONPATH" in line for line in self.profile.prologue):
+        if self._prologue_sets_path:
             return None
         given = self.profile.env.get("PYTHONPATH", "")
         folders = [folder for folder in given.split(":") if folder]
@@ -422,7 +431,7 @@ def _values(grid: Export) -> dict[str, Any]:
         "signal": profile.signal.name, "lead_seconds": profile.signal.lead_seconds,
         "max_requeues": profile.max_requeues, "ray_tries": _RAY_TRIES,
         "stop_seconds": round(manifest.resources.grace_seconds) + 60,
-        "own_modules": grid.own_modules, **_confirmation(grid),
+        "own_modules": grid.own_modules, "sets_path": grid.sets_path, **_confirmation(grid),
         "sync": manifest.tracking.anywhere,
         "where": "." if grid.root is None else str(grid.root / manifest.name),
         "env": {_Safe(name): value for name, value in profile.env.items()},
