@@ -491,7 +491,7 @@ def test_many_cells_are_drawn_in_panels(tmp_path: Path) -> None:
     assert "grey: the baseline" in report.markdown
     assert report.table[3]["steps to the threshold"] == "untestable"
     assert report.remarks[-1].startswith(
-        "Untestable steps to the threshold, one seed shows no noise at step 0: a=1 b=1, a=1 b=2, "
+        "Untestable steps to the threshold, one seed shows no noise at step 0, more seeds do: a=1 b=1, a=1 b=2, "
     )
     assert report.table[3]["test return, IQM [95 %]"] == "3.000 [—] (1/1)"
 

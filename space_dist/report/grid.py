@@ -260,7 +260,7 @@ def _untestable(cell: CellRuns, threshold: float) -> str:
         ends = [run.status.steps for run in cell.configuration.finished]
         return f"untestable: runs end by episodes (at {min(ends):,} to {max(ends):,} steps)"
     if len(starts) < 2:
-        return "untestable: one seed shows no noise at step 0"
+        return "untestable: one seed shows no noise at step 0, more seeds do"
     bound = start_bound(starts)
     if threshold <= bound:
         return f"untestable: within noise of step 0 (up to {bound:.4g})"
