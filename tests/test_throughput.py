@@ -30,7 +30,7 @@ import benchmark
 from benchmarks.batched_vec_env import BatchedVecEnv
 from benchmarks.contenders import TASKS, Contender, specification
 from benchmarks.pic import _shown
-from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, _searched, process
+from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, _searched, fastest, process
 
 LINE = "tests.tiny_env:make"
 
@@ -157,6 +157,31 @@ def test_the_tasks_differ_in_nothing_but_what_they_say(name: str) -> None:
     assert (learner.kind, learner.n_steps, learner.net_arch) == ("ppo", task.n_steps, (64, 64))
     assert (learner.batch_size, learner.n_epochs) == (task.batch_size, 10)
     assert name in specification(name, Contender("ours"), 1.0)
+
+
+def test_what_does_not_finish_is_no_speed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    rates = {16: 0.0, 64: 250.0}
+    monkeypatch.setattr(
+        "benchmarks.throughput.measured", lambda task, contender, *_, **__: {"rate": rates[contender.n_envs]}
+    )
+    tried = [Contender("sb3", vec_env="batched", n_envs=n) for n in rates]
+    assert fastest("cartpole", tried, 0.5) is tried[1]
+    said = capsys.readouterr().out
+    assert "(16), 1 torch thread: none finished\n" in said
+    assert "(64), 1 torch thread: 250 steps/s\n" in said
+    rates[64] = 0.0
+    with pytest.raises(
+        SpaceDistError, match=r"cartpole: of 2 settings that were tried none finished .* a shorter --seconds"
+    ):
+        fastest("cartpole", tried, 0.5)
+
+
+def test_a_ratio_leaves_out_rounds_that_the_rival_did_not_finish() -> None:
+    never, once, lean = row(0.0, 0.0, simulator=1.0), row(0.0, 100.0), row(400.0, 300.0)
+    assert (_ratio(lean, never), _ratio(lean, once), _ratio(never, lean)) == (None, 3.0, 0.0)
+    text = _markdown({"cartpole": {"subproc2": never, "lean": lean}}, {}, {}, 2, [])
+    assert "| somebody | somehow | none finished | — | 0% |  |" in text
+    assert "| somebody | somehow | 350 (300-400) | — | 70% |" in text
 
 
 def test_every_ratio_has_a_goal() -> None:

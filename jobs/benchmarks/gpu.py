@@ -10,7 +10,7 @@ from rich.console import Console
 
 from benchmarks.contenders import Contender
 from benchmarks.results import JsonFile, can_be_a_folder, keep
-from benchmarks.throughput import Row, fastest, measured, not_installed
+from benchmarks.throughput import Row, fastest, in_words, measured, not_installed
 from space_dist.errors import SpaceDistError
 
 TASK = "pointmass"
@@ -51,7 +51,7 @@ def gpu(
         for row in rows.values():
             row.take()
             console.print(
-                f"round {number + 1}: {row.title}, {row.setting}: {row.rates[-1]:,.0f} steps/s",
+                f"round {number + 1}: {row.title}, {row.setting}: {in_words(row.rates[-1])}",
                 markup=False,
                 soft_wrap=True,
             )
@@ -84,9 +84,7 @@ def _markdown(name: str, rows: dict[str, Row], rounds: int) -> str:
         "| | setting | steps/s |",
         "|---|---|---:|",
     ]
-    for row in rows.values():
-        span = f"{row.rate:,.0f} ({min(row.rates):,.0f}-{max(row.rates):,.0f})"
-        lines.append(f"| {row.title} | {row.chosen} | {span} |")
+    lines += [f"| {row.title} | {row.chosen} | {row.span} |" for row in rows.values()]
     if "jax" in not_installed():
         lines.append("| JAX | not installed (extra `bench`) | |")
     return "\n".join(lines) + "\n"

@@ -92,6 +92,13 @@ class Row:
         return statistics.median(self.rates)
 
     @property
+    def span(self) -> str:
+        """Median, least and most over the rounds."""
+        if not self.rate:
+            return "none finished"
+        return f"{self.rate:,.0f} ({min(self.rates):,.0f}-{max(self.rates):,.0f})"
+
+    @property
     def chosen(self) -> str:
         """The setting, and what compiling took, which no rate but those of whole wall times has in it."""
         if not self.compiling:
@@ -100,7 +107,7 @@ class Row:
 
     def limit(self) -> str:
         """Where its time goes, as far as can be told: what is left is dispatch."""
-        if not self.waits:
+        if not self.waits or not self.rate:
             return ""
         shares = {cause: min(1.0, seconds * self.rate) for cause, seconds in self.waits.items()}
         shares["dispatch"] = max(0.0, 1.0 - sum(shares.values()))
@@ -152,15 +159,16 @@ def throughput(
             for row in rows.values():
                 row.take()
                 console.print(
-                    f"round {number + 1}, {name}: {row.title}: {row.rates[-1]:,.0f} steps/s",
+                    f"round {number + 1}, {name}: {row.title}: {in_words(row.rates[-1])}",
                     markup=False,
                     soft_wrap=True,
                 )
     ratios = {
-        name: _ratio(table[task][ours], table[task][rival])
+        name: ratio
         for name, (task, ours, rival) in PAIRS.items()
         if task in table and rival in table[task]
-    }
+        and (ratio := _ratio(table[task][ours], table[task][rival])) is not None
+    }  # fmt: skip
     projected = _table1(member_steps) if "table1" in parts else {}
     text = _markdown(table, ratios, projected, rounds, missing)
     console.print(text, markup=False, soft_wrap=True)
@@ -176,9 +184,18 @@ def throughput(
         raise typer.Exit(1)
 
 
-def _ratio(ours: Row, rival: Row) -> float:
-    """Median of the rounds' ratios: what slows the whole machine for a while slows both."""
-    return statistics.median(one / other for one, other in zip(ours.rates, rival.rates, strict=True))
+def _ratio(ours: Row, rival: Row) -> float | None:
+    """Median of the rounds' ratios: what slows the whole machine for a while slows both.
+
+    Of rounds that the rival has finished; None if there is none.
+    """
+    found = [one / other for one, other in zip(ours.rates, rival.rates, strict=True) if other]
+    return statistics.median(found) if found else None
+
+
+def in_words(rate: float) -> str:
+    """Steps per second; none where nothing was finished, which is no speed."""
+    return f"{rate:,.0f} steps/s" if rate else "none finished"
 
 
 # ---- who is measured ----
@@ -279,14 +296,22 @@ def _best_jax(task: str, seconds: float, *, members: int) -> Contender:
 
 
 def fastest(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
-    """The fastest in one short measurement each; one that does not get it done in a minute is none."""
+    """The fastest in one short measurement each; one that does not get it done in a minute is none.
+
+    Raises SpaceDistError if that is so of all.
+    """
     rates = {contender: measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders}
     for contender, rate in rates.items():
         console.print(
-            f"search, {task}: {contender.title}, {contender.setting}: {rate:,.0f} steps/s",
+            f"search, {task}: {contender.title}, {contender.setting}: {in_words(rate)}",
             style="dim",
             markup=False,
             soft_wrap=True,
+        )
+    if not any(rates.values()):
+        raise SpaceDistError(
+            f"{task}: of {len(rates)} settings that were tried none finished within {PATIENCE:.0f} s, its start "
+            "and warm-up included; give the machine less else to do, or the benchmark a shorter --seconds"
         )
     return max(rates, key=lambda contender: rates[contender])
 
@@ -505,10 +530,10 @@ def _markdown(
         lines += [f"**{_title(part)}**", "", "| | setting | steps/s | ratio | of the kernel | where the time goes |",
                   "|---|---|---:|---:|---:|---|"]  # fmt: skip
         for row in rows.values():
-            span = f"{row.rate:,.0f} ({min(row.rates):,.0f}-{max(row.rates):,.0f})"
+            ratio = _ratio(row, first)
             lines.append(
-                f"| {row.title} | {row.chosen} | {span} | {_ratio(row, first):.1f} | {row.rate * row.kernel:.0%} "
-                f"| {row.limit()} |"
+                f"| {row.title} | {row.chosen} | {row.span} | {'—' if ratio is None else f'{ratio:.1f}'} "
+                f"| {row.rate * row.kernel:.0%} | {row.limit()} |"
             )
         there = {"rllib": part in TASKS, "jax": part in JITTED or part not in TASKS, "sbx": True}
         lines += [f"| {EXTRA[name]} | not installed (extra `bench`) | | | | |" for name in missing if there[name]]
