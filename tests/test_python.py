@@ -28,6 +28,7 @@ from space_dist.errors import ConfigError, LedgerError
 from space_dist.grid.planning import plan
 from space_dist.grid.tuning import plan_search
 from space_dist.ledger import CURRICULUM, METRICS, RunWriter
+from space_dist.run.pace import TimeLeft
 from space_dist.run.training import Progress
 from space_dist.tracking.pusher import Pusher
 from tests.commanding import command
@@ -389,7 +390,28 @@ def test_a_rate_that_cannot_be_told_yet_is_a_dash() -> None:
 def test_how_far_a_run_is_goes_by_the_limit_that_is_nearer() -> None:
     known = Progress(1000, 60_000, 500.0, 1, 3, episodes=25, budget_episodes=100)
     assert "  1,000/60,000 steps, 25/100 episodes (25%)" in progress.line_of_run("cartpole", 0, known)
-    assert known.seconds_left == pytest.approx(3 * 1000 / 500)
-    assert dataclasses.replace(known, episodes=102).seconds_left is None
-    by_steps = dataclasses.replace(known, steps=30_000)
-    assert (by_steps.share, by_steps.seconds_left) == (0.5, pytest.approx(60.0))
+    assert known.share == 0.25
+    assert dataclasses.replace(known, episodes=102).share == 1.0
+    assert dataclasses.replace(known, steps=30_000).share == 0.5
+
+
+def test_time_left_is_told_once_rounds_of_some_seconds_tell_it() -> None:
+    left = TimeLeft()
+    assert left.after(0.5, 100.0) is None  # however far it went on from, and however long that took
+    assert left.after(0.6, 130.0) is None  # one round says little
+    assert left.after(0.7, 160.0) == pytest.approx(90.0)
+    assert left.after(1.0, 250.0) is None
+    quick = TimeLeft()
+    told = [quick.after(0.001 * number, 0.1 * number) for number in range(1, 101)]
+    assert told[:50] == [None] * 50
+    assert told[60:] == pytest.approx([0.1 * (1000 - number) for number in range(61, 101)])
+
+
+def test_time_left_goes_by_the_last_minute() -> None:
+    left = TimeLeft()
+    for second in range(101):  # as of a learner that only collects at first
+        left.after(0.005 * second, float(second))
+    told = [left.after(0.5 + 0.001 * second, 100.0 + second) for second in range(1, 101)]
+    assert told[-1] == pytest.approx(400.0)
+    slow = TimeLeft()
+    assert [slow.after(0.1 * number, 1000.0 * number) for number in range(1, 6)][-1] == pytest.approx(5000.0)

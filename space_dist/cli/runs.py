@@ -371,14 +371,15 @@ def _display(name: str, seed: int) -> Iterator[tuple[Callable[[Progress], None],
         rich_progress.TextColumn("[bold]{task.description}"),
         rich_progress.BarColumn(),
         rich_progress.TextColumn("{task.fields[line]}"),
-        rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.fields[left]}"),
         console=console,
     )
     with bar:
-        task = bar.add_task(f"{name} s{seed}", total=None, line="reading instances and environment")
+        task = bar.add_task(f"{name} s{seed}", total=None, left="", line="reading instances and environment")
 
         def observe(progress: Progress) -> None:
-            bar.update(task, completed=progress.share, total=1.0, line=_in_words(progress))
+            line, left = _in_words(progress), _time_left(progress)
+            bar.update(task, completed=progress.share, total=1.0, line=line, left=left)
 
         yield observe, lambda what: bar.update(task, line=what)
 
@@ -392,11 +393,16 @@ def _lines(title: str) -> tuple[Callable[[Progress], None], Callable[[str], None
         now = time.monotonic()
         if now - said_at < _LINE_SECONDS and progress.share < 1:
             return
-        said_at, left = now, progress.seconds_left
-        remaining = "" if left is None else f"  {datetime.timedelta(seconds=round(left))} left"
-        say(f"{title}: {_in_words(progress)}{remaining}")
+        said_at = now
+        say("  ".join(filter(None, (f"{title}: {_in_words(progress)}", _time_left(progress)))))
 
     return observe, lambda what: say(f"{title}: {what}")
+
+
+def _time_left(progress: Progress) -> str:
+    """`0:01:20 left`; nothing where that cannot be told."""
+    left = progress.seconds_left
+    return "" if left is None else f"{datetime.timedelta(seconds=round(left))} left"
 
 
 def _in_words(progress: Progress) -> str:

@@ -54,6 +54,7 @@ from space_dist.rollout.policy import Statistics, blind, policies_of
 from space_dist.rollout.walk import Walk
 from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
+from space_dist.run.pace import TimeLeft
 from space_dist.run.requests import Learn, Wait, Work
 from space_dist.run.rows import iteration_row, next_evaluation, position, summary, trained_row
 from space_dist.run.starting import start_from
@@ -71,7 +72,7 @@ class Progress:
 
     steps, budget_steps: environment steps.  set_size: how many of `n_instances` are selected.  train_return,
     test_return: means of the last evaluation; None before the first.  episodes, budget_episodes: of training; None
-    where they are not limited.
+    where they are not limited.  seconds_left: at the pace of the last minute; None until some rounds have told that.
     """
 
     steps: int
@@ -83,19 +84,13 @@ class Progress:
     test_return: float | None = None
     episodes: int = 0
     budget_episodes: int | None = None
+    seconds_left: float | None = None
 
     @property
     def share(self) -> float:
         """How much is done, from 0 to 1, by the limit that is nearer: steps or episodes."""
         by_steps = self.steps / max(1, self.budget_steps)
         return min(1.0, max(by_steps, self.episodes / self.budget_episodes if self.budget_episodes else 0.0))
-
-    @property
-    def seconds_left(self) -> float | None:
-        """At its pace, to the limit that is nearer; None where it is there, or that cannot be told."""
-        if not (self.steps and self.steps_per_second > 0 and self.share < 1):
-            return None
-        return self.steps * (1 / self.share - 1) / self.steps_per_second
 
     @property
     def so_far(self) -> str:
@@ -170,6 +165,7 @@ class Training:
         self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
+        self._time_left = TimeLeft()
         self._last_commit_round, self._commit_cost = 0, 0.0  # seconds, that the last one took to write
         self.progress = Progress(
             0, self._total_steps, 0.0, 0, len(setup.train), budget_episodes=self._config.budget.episodes
@@ -632,4 +628,5 @@ class Training:
 
     def _show(self) -> None:
         self.progress.steps, self.progress.episodes = self._run.steps, self._run.episodes
+        self.progress.seconds_left = self._time_left.after(self.progress.share, time.monotonic())
         self._observe(self.progress)
