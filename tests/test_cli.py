@@ -20,9 +20,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from space_dist import cli
-from space_dist.cli import runs, terminal
+from space_dist.cli import overview, runs, terminal
 from space_dist.config import RunConfig, reading
-from space_dist.ledger import CURRICULUM, METRICS, Ledger
+from space_dist.experiment.manifest import Cell, Grid, Run
+from space_dist.grid.conductor import Overview
+from space_dist.ledger import CURRICULUM, METRICS, Ledger, encode_row
 from space_dist.slurm.profile import Profile
 from space_dist.system.interrupts import StopRequests
 from tests import prepared
@@ -622,28 +624,51 @@ def test_cells_never_look_alike_however_narrow_the_terminal(
                     assert said.count(label) == 1
 
 
-def test_time_left_is_told_by_the_rate_of_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from space_dist.cli import overview
-    from space_dist.experiment.manifest import Cell, Grid, Run
-    from space_dist.grid.conductor import Overview
-    from space_dist.ledger import encode_row
+def begun_run(place: Path, config: dict[str, object], row: dict[str, object]) -> Run:
+    """A grid's run with this last whole row, behind which another is half written."""
+    run = Run(Cell("0" * 12, "cell", {}, config), 0)
+    ledger = Grid(place).ledger(run)
+    ledger.folder.mkdir(parents=True)
+    (ledger.folder / METRICS).write_bytes(encode_row({"kind": "iteration", **row}) + b'{"kind":"iterat')
+    return run
 
+
+def test_time_left_is_told_by_the_rate_of_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(overview.time, "monotonic", lambda: now[0])
     left = overview._TimeLeft(Grid(tmp_path))
     assert left.in_words(Overview(4, 4000)) == ", 4,000 steps left"
-    now[0] += 60.0
-    assert left.in_words(Overview(4, 3000, done=1)) == ", 3,000 steps left, about 0:03:00"
     run = Run(Cell("0" * 12, "cell", {}, {}), 0)
-    begun = overview._TimeLeft(Grid(tmp_path))
-    assert begun.in_words(Overview(1, 4000, running=[run])) == ", 4,000 steps left, starting"
-    ledger = Grid(tmp_path).ledger(run)
-    ledger.folder.mkdir(parents=True)
-    (ledger.folder / METRICS).write_bytes(encode_row({"kind": "iteration", "steps": 500}) + b'{"kind":"iterat')
-    now[0] += 60.0  # what runs counts by its rows, of which the last is half written
-    assert left.in_words(Overview(4, 3000, done=1, running=[run])) == ", 2,500 steps left, about 0:03:20"
+    now[0] += 60.0  # in which it loaded libraries and compiled: nothing to go by
+    assert left.in_words(Overview(4, 4000, running=[run])) == ", 4,000 steps left, starting"
+    begun_run(tmp_path, {}, {"steps": 500})  # what runs counts by its rows
+    now[0] += 6.0
+    assert left.in_words(Overview(4, 4000, running=[run])) == ", 3,500 steps left"
+    now[0] += 6.0  # seconds say little
+    assert left.in_words(Overview(4, 3000, done=1)) == ", 3,000 steps left"
+    now[0] += 54.0
+    assert left.in_words(Overview(4, 3000, done=1, running=[run])) == ", 2,500 steps left, about 0:02:30"
     now[0] += 1.0  # too soon to count anew, but that another one is done
-    assert left.in_words(Overview(4, 3000, done=1)) == ", 2,500 steps left, about 0:03:20"
-    assert left.in_words(Overview(4, 2000, done=2)) == ", 2,000 steps left, about 0:02:01"
+    assert left.in_words(Overview(4, 3000, done=1)) == ", 2,500 steps left, about 0:02:30"
+    now[0] += 59.0
+    assert left.in_words(Overview(4, 2000, done=2)) == ", 2,000 steps left, about 0:02:40"
     now[0] += 60.0
     assert left.in_words(Overview(4, 0, done=4)) == ""
+
+
+def test_time_left_goes_by_episodes_where_these_end_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(overview.time, "monotonic", lambda: now[0])
+    run = begun_run(tmp_path, {"budget": {"steps": 9000, "episodes": 40}}, {"steps": 500, "episodes": 10})
+    by_episodes = functools.partial(Overview, 4, 36_000, by_episodes=True)
+    left = overview._TimeLeft(Grid(tmp_path))
+    assert left.in_words(by_episodes(160)) == ", 160 episodes left"
+    assert left.in_words(by_episodes(160, running=[run])) == ", 160 episodes left"
+    now[0] += 10.0
+    assert left.in_words(by_episodes(160, running=[run])) == ", 150 episodes left"
+    now[0] += 60.0
+    seen = by_episodes(160, running=[run])
+    seen.leave_out(run)
+    assert (seen.steps_left, seen.episodes_left) == (27_000, 120)
+    assert left.in_words(seen) == ", 110 episodes left, about 0:02:45"
+    assert overview._TimeLeft(Grid(tmp_path)).in_words(by_episodes(None)) == ""  # they end some of the runs

@@ -29,6 +29,7 @@ _SHOWN_RUNS = 12
 _IDLE_LOOKS = 2  # of --watch
 _ANY_WIDTH = 10_000  # characters
 _COUNT_SECONDS = 5.0  # between two looks at how far all running runs are
+_ENOUGH_SECONDS = 10.0  # of stepping, before which a rate says little: two such looks
 
 
 @contextlib.contextmanager
@@ -59,32 +60,45 @@ def display(manifest: Manifest, place: Grid) -> Iterator[Callable[[Overview], No
 
 
 class _TimeLeft:
-    """How many steps a grid still takes, and how long, at the rate of what was seen of it."""
+    """How much a grid still takes, and how long, at the rate of what was seen of it since its first run stepped."""
 
     def __init__(self, place: Grid) -> None:
         self._place = place
-        self._first: tuple[float, int] | None = None  # when we looked first, and the steps that were left then
+        self._at_first: int | None = None  # what was left when we looked first
+        self._stepping: tuple[float, int] | None = None  # when we saw a run step first, and what was left then
         self._looked, self._done, self._words = 0.0, 0, ""
 
     def in_words(self, overview: Overview) -> str:
-        """`, 614,400 steps left, about 0:12:00`; the time as soon as it can be told."""
+        """`, 614,400 steps left, about 0:12:00`, or episodes where these end runs; the time as soon as it can be told.
+
+        Nothing where episodes end some runs, and not the others.
+        """
+        if overview.by_episodes and overview.episodes_left is None:
+            return ""
         now = time.monotonic()
         if now - self._looked >= _COUNT_SECONDS or overview.done != self._done or not overview.steps_left:
             self._looked, self._done, self._words = now, overview.done, self._estimated(overview, now)
         return self._words
 
     def _estimated(self, overview: Overview, now: float) -> str:
-        taken = sum(_steps_of(self._place.ledger(run)) for run in overview.running)
-        left = max(0, overview.steps_left - taken)
-        if self._first is None:
-            self._first = now, left
-        seconds, done = now - self._first[0], self._first[1] - left
+        if overview.episodes_left is None:
+            what, budgets, so_far = "steps", overview.steps_left, _steps_of
+        else:
+            what, budgets, so_far = "episodes", overview.episodes_left, _episodes_of
+        taken = sum(so_far(self._place.ledger(run)) for run in overview.running)
+        left = max(0, budgets - taken)
+        if self._at_first is None:
+            self._at_first = left
         if not left:
             return ""
-        if overview.running and not taken and done <= 0:
-            return f", {left:,} steps left, starting"
-        about = f", about {datetime.timedelta(seconds=round(left * seconds / done))}" if done > 0 else ""
-        return f", {left:,} steps left{about}"
+        if self._stepping is None and left < self._at_first:
+            self._stepping = now, left
+        if self._stepping is None:
+            return f", {left:,} {what} left" + (", starting" if overview.running else "")
+        seconds, done = now - self._stepping[0], self._stepping[1] - left
+        enough = done > 0 and seconds >= _ENOUGH_SECONDS
+        about = f", about {datetime.timedelta(seconds=round(left * seconds / done))}" if enough else ""
+        return f", {left:,} {what} left{about}"
 
 
 def _steps_of(ledger: Ledger) -> int:
@@ -96,6 +110,13 @@ def _steps_of(ledger: Ledger) -> int:
         row = decode_row(line.encode() + b"\n")
         if row is not None and isinstance(row.get("steps"), int):
             return int(row["steps"])
+    return 0
+
+
+def _episodes_of(ledger: Ledger) -> int:
+    """The same in training episodes; 0, too, of a run whose rows cannot be read now."""
+    with contextlib.suppress(SpaceDistError):
+        return ledger.episodes()
     return 0
 
 
@@ -117,7 +138,10 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
             shown = f"{evaluations[-1]['test']['return']:.3g}" if evaluations else "—"
             steps = rows[-1]["steps"] if rows else 0
             size = len(rows[-1]["trained"]) if rows else 0
-            line = f"{steps:>10,} of {run.cell.steps_to_take:,} steps   set {size}   test return {shown}"
+            taken = f"{steps:>10,} of {run.cell.steps_to_take:,} steps"
+            if (limit := run.cell.episodes_to_take) is not None:
+                taken += f", {_episodes_of(ledger):,} of {limit:,} episodes"
+            line = f"{taken}   set {size}   test return {shown}"
         table.add_row(Text(run.title), Text(line))
     if len(overview.running) > _SHOWN_RUNS:
         table.add_row("", Text(f"and {len(overview.running) - _SHOWN_RUNS} more"))

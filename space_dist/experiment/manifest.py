@@ -68,6 +68,12 @@ class Cell:
         """Environment steps that each of its runs is to take for now."""
         return self.pause_at or self.budget_steps
 
+    @property
+    def episodes_to_take(self) -> int | None:
+        """Training episodes that may end each of its runs before those steps do; None: nothing but steps ends them."""
+        episodes = self.config["budget"].get("episodes")
+        return None if episodes is None or self.pause_at else int(episodes)
+
 
 @dataclass(frozen=True)
 class Run:

@@ -132,15 +132,27 @@ class Executor(Protocol):
 
 @dataclass
 class Overview:
-    """What a display shows. steps_left: of the budgets of all runs that are neither done nor given up."""
+    """What a display shows.
+
+    steps_left, episodes_left: of the budgets of all runs that are neither done nor given up; the latter None where not
+    all of the grid's runs end by episodes, and by_episodes says whether some do.
+    """
 
     total: int
     steps_left: int
+    episodes_left: int | None = None
+    by_episodes: bool = False
     done: int = 0
     failed: int = 0
     waiting: int = 0
     running: list[Run] = field(default_factory=list)
     message: str = ""
+
+    def leave_out(self, run: Run) -> None:
+        """It is done, or given up: nothing is left of its budget."""
+        self.steps_left -= run.cell.steps_to_take
+        if self.episodes_left is not None:
+            self.episodes_left -= run.cell.episodes_to_take or 0
 
 
 class Conductor:
@@ -163,7 +175,12 @@ class Conductor:
         self._elsewhere: dict[str, Run] = {}
         self._abandoned: dict[str, float] = {}  # since when, on the monotonic clock
         self._shares: dict[str, tuple[int, int]] = {}  # by stack: the most that have waited, and of these in a process
-        self._overview = Overview(len(runs), sum(run.cell.steps_to_take for run in runs))
+        episodes = [run.cell.episodes_to_take for run in runs]
+        limited = [each for each in episodes if each is not None]
+        self._overview = Overview(
+            len(runs), sum(run.cell.steps_to_take for run in runs),
+            episodes_left=sum(limited) if limited and len(limited) == len(runs) else None, by_episodes=bool(limited),
+        )  # fmt: skip
 
     def conduct(self) -> list[RunStatus]:
         """Until nothing is left to do. Raises Interrupted, after all live runs have ended, if asked to stop.
@@ -224,7 +241,7 @@ class Conductor:
             waiting.append((time.monotonic() + delay, run))
         elif run_status.condition == "failed":
             self._overview.failed += 1
-            self._overview.steps_left -= run.cell.steps_to_take
+            self._overview.leave_out(run)
             log.warning("%s: %s: %s", run.title, run_status.in_words, run_status.detail)
         elif not run_status.end_recorded and run_status.supervised:
             self._elsewhere[run.key] = run
@@ -306,7 +323,7 @@ class Conductor:
             log.warning("%s: %s, and no record of it: %s", run.title, ended.cause.in_words, ended.detail)
             self._overview.message = f"{run.title}: {ended.detail}"
             self._overview.failed += 1
-            self._overview.steps_left -= run.cell.steps_to_take
+            self._overview.leave_out(run)
             self._unrecorded[run.key] = ended.detail
             return
         again = may_retry(ended.cause, history.ends, self._manifest.retry)
@@ -317,7 +334,7 @@ class Conductor:
 
     def _note_done(self, run: Run) -> None:
         self._overview.done += 1
-        self._overview.steps_left -= run.cell.steps_to_take
+        self._overview.leave_out(run)
 
     def _has_got_on(self, run: Run) -> bool:
         """Whether its last attempt has committed anything: then it is not the run that makes its attempts fail."""

@@ -155,6 +155,10 @@ class Ledger:
             intact += len(line)
         return rows
 
+    def episodes(self) -> int:
+        """Training episodes that ended, by the iterations that are written. Raises LedgerError as `rows` does."""
+        return sum(int(row["episodes"]) for row in self.rows() if row["kind"] == "iteration")
+
     def read(self, path: Path) -> bytes:
         """A file of the run that is written whole (config, instances, model), as its writer left it.
 
