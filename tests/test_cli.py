@@ -261,6 +261,8 @@ def test_a_run_that_ends_by_its_episodes_says_so(capsys: pytest.CaptureFixture[s
     assert f"{steps:,}/20,000 steps, 4/4 episodes" in last
     assert f"done, 4 of 4 episodes, {steps:,} environment steps" in ended
     assert "budget of 20000 environment steps, or of 4 episodes" in (tmp_path / "run/log.txt").read_text()
+    code, again, _ = run(capsys, "train", config, "--out", tmp_path / "run", *sets, "--resume")
+    assert (code, again) == (0, f"{ended.replace(' done', ' was already done')}\n")
 
 
 def same(one: Path, other: Path) -> bool:
@@ -594,10 +596,29 @@ def test_progress_shows_the_last_evaluation_at_the_end_and_after_resuming(
     _, said, _ = run(capsys, *command)
     assert said.splitlines()[-2].endswith(returns(-1))
     _, said, _ = run(capsys, *command, "--set", "budget.steps=8192", "--resume")
-    first, *_, last, _ = [line for line in said.splitlines() if " steps" in line]
+    begun, first, *_, last, _ = [line for line in said.splitlines() if " steps" in line]
+    assert begun == "pointmass_space s0: going on at 3,840 steps, under a larger budget"
     assert returns(0) in first  # a larger budget goes on from the round before the last, and the last evaluation
     assert last.endswith(returns(-1))
     assert len({returns(0), returns(1), returns(2)}) == 3
+
+
+def test_what_is_left_of_a_budget_and_where_a_run_goes_on_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    settings = [part for setting in (*SMALL, "checkpoint.every_rounds=1000") for part in ("--set", setting)]
+    command = ["train", CONFIG, *settings, "--out", tmp_path / "run", "--resume"]
+    short = (*command, "--set", "budget.steps=600")
+    left_over = f"512 of 600 environment steps: another update takes 256. {tmp_path / 'run'}\n"
+    _, said, _ = run(capsys, *short)
+    assert "512/512 steps" in said
+    assert said.endswith(f"done, {left_over}")
+    _, said, _ = run(capsys, *short)
+    assert said == f"pointmass_space, seed 0: was already done, {left_over}"
+    _, said, _ = run(capsys, *command, "--set", "budget.steps=700")
+    why = "there is no checkpoint from before the end of the smaller one"
+    assert f"pointmass_space s0: beginning anew, under a larger budget: {why}\n" in said
+    assert f"beginning anew, under a larger budget: {why}" in (tmp_path / "run/log.txt").read_text()
 
 
 def test_cells_never_look_alike_however_narrow_the_terminal(

@@ -44,6 +44,15 @@ def test_the_example_in_the_documentation_is_short_and_works(
     assert "custom chooses by rules of its own, so it has no lines 6 to 13" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("example")
+def test_one_that_probes_nothing_counts_up_to_whole_updates() -> None:
+    config = chosen('curriculum={kind: custom, import: "tests.faulty_curricula:Honest"}', "budget.steps=1000")
+    blueprint = Blueprint.of(config)
+    curriculum = blueprint.curriculum(*blueprint.instances())
+    assert blueprint.reachable_steps(curriculum) == 768
+    assert blueprint.total_steps == 1000  # by which learning rates fall, whatever it probes
+
+
 @pytest.mark.ray
 @pytest.mark.usefixtures("one_ray")
 def test_neither_workers_nor_a_kill_change_a_byte(example: Path) -> None:

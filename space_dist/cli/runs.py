@@ -19,8 +19,10 @@ from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, s
 from space_dist.errors import ConfigError, about, counted, exits_refused
 
 if TYPE_CHECKING:
+    from space_dist.config import BudgetConfig
     from space_dist.experiment.manifest import Grid
     from space_dist.report import GridReport, Report
+    from space_dist.run.launch import Outcome
     from space_dist.run.training import Progress
 
 _REPORT_WIDTH = 200  # characters
@@ -55,26 +57,28 @@ def train(
     changes = [*(overrides or ()), *settings]
     run = configs.load(config, changes)
     folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
-    episodes = 0
-
-    def observed(progress: Progress) -> None:
-        nonlocal episodes
-        episodes = progress.episodes
-        observe(progress)
-
     with about(str(config), configs.origins(changes)), _display(run.name, run.seed) as (observe, waiting):
         outcome = launch(
-            run, folder, resume=resume, stop=STOP, observe=observed, waiting=waiting,
+            run, folder, resume=resume, stop=STOP, observe=observe, waiting=waiting,
             tell=lambda sentence: warn(f"space-dist: {sentence}"),
+            going_on=lambda where: say(f"{run.name} s{run.seed}: {where}"),
         )  # fmt: skip
-    status = outcome.ledger.status()
     verb = "was already done" if outcome.already_done else "done"
-    if run.budget.episodes is not None and episodes:
-        verb += f", {episodes:,} of {run.budget.episodes:,} episodes"
-    say(f"{run.name}, seed {run.seed}: {verb}, {status.steps:,} environment steps. {folder}")
+    say(f"{run.name}, seed {run.seed}: {verb}, {_taken(outcome, run.budget)}. {folder}")
     _name_pages(outcome.pages)
     if outcome.tracking_warning:
         warn(f"warning: {outcome.tracking_warning}")
+
+
+def _taken(outcome: Outcome, budget: BudgetConfig) -> str:
+    """`40 of 40 episodes, 6,144 environment steps`, by what is on disk; and why steps of the budget were left over."""
+    steps, ended, enough = outcome.ledger.status().steps, "", False
+    if budget.episodes is not None:
+        episodes = outcome.ledger.episodes()
+        ended, enough = f"{episodes:,} of {budget.episodes:,} episodes, ", episodes >= budget.episodes
+    if enough or steps >= budget.steps:
+        return f"{ended}{steps:,} environment steps"
+    return f"{ended}{steps:,} of {budget.steps:,} environment steps: another update takes {outcome.next_round}"
 
 
 def evaluate(

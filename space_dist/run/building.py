@@ -174,12 +174,25 @@ class Blueprint:
     def total_steps(self) -> int:
         """Environment steps of a whole run: those of the rounds that fit.
 
-        The budget, where rounds end by episodes or probes come between them.
+        The budget, where rounds end by episodes or probes may come between them. Learning rates fall by it.
         """
+        return self._whole_rounds(probes=self.config.curriculum.may_probe)
+
+    def reachable_steps(self, curriculum: Curriculum) -> int:
+        """The same of a run under this curriculum, one of whose kind might probe, and this may not."""
+        return self._whole_rounds(probes=curriculum.wants.probes)
+
+    def _whole_rounds(self, *, probes: bool) -> int:
         config, round_steps = self.config, self.config.round_steps(self.spec.horizon)
-        if config.n_episodes is not None or config.curriculum.may_probe:
+        if config.n_episodes is not None or probes:
             return config.budget.steps
         return config.budget.steps // round_steps * round_steps
+
+    @property
+    def round_in_words(self) -> str:
+        """Environment steps of a round: `2,048`, or `up to 1,600` where it ends by episodes."""
+        most = self.config.round_steps(self.spec.horizon)
+        return f"{most:,}" if self.config.n_episodes is None else f"up to {most:,}"
 
     @property
     def stack(self) -> str:

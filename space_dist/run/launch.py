@@ -59,10 +59,14 @@ _FINAL_PUSH_SECONDS = 45.0  # for all of it: a server that answers badly (20 s a
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a launch ended: the run's ledger, whether it was done before, what MLflow's mirror lacks, and its pages."""
+    """How a launch ended: the run's ledger, whether it was done before, what MLflow's mirror lacks, and its pages.
+
+    next_round: environment steps that another round would have taken: `2,048`, or `up to 1,600` by its episodes.
+    """
 
     ledger: Ledger
     already_done: bool = False
+    next_round: str = ""
     tracking_warning: str | None = None
     pages: tuple[str, ...] = ()
 
@@ -77,18 +81,22 @@ def launch(
     observe: Callable[[Progress], None] = lambda progress: None,
     waiting: Callable[[str], None] = lambda what: None,
     tell: Callable[[str], None] = lambda sentence: None,
+    going_on: Callable[[str], None] = lambda where: None,
 ) -> Outcome:
     """Run `config` in `folder` to its end, or go on where it stopped.
 
     pause_at: environment steps at which it is paused, behind the first update that is made then, to be gone on with by
     another launch; 0: nowhere. observe: told of progress. waiting: told what is waited for, before and behind that:
-    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too.
+    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too. going_on: told where a run
+    goes on that was there: `going on at 18,432 steps`.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
     SpaceDistError after noting it in the run's status.
     """
     with begun(config, folder, resume=resume, stop=stop, pause_at=pause_at) as active:
+        if active.goes_on:
+            going_on(active.goes_on)
         for part in active.parts():
             with _cluster(part, waiting, tell) as cluster:
                 waiting("preparing the learner")
@@ -103,8 +111,8 @@ def launch(
 class ActiveRun:
     """A run that is this process's own now.
 
-    outcome: how it ends; `already_done` where there is nothing to do. pause_at and what
-    follows: as of `Training`.
+    outcome: how it ends; `already_done` where there is nothing to do. goes_on: where, in words; empty where it begins.
+    pause_at and what follows: as of `Training`.
     """
 
     blueprint: Blueprint
@@ -113,6 +121,7 @@ class ActiveRun:
     status: Status
     stop: StopRequests
     outcome: Outcome
+    goes_on: str = ""
     pusher: Pusher | None = None
     pause_at: int = 0
     change_at: int = 0
@@ -207,9 +216,9 @@ def _begun(
             "out=DIR)"
         )
     with RunWriter(ledger) as writer:
-        status = _claim(blueprint, setup, writer, stop, pause_at)
-        done = Outcome(ledger, already_done=status.has_reached(pause_at))
-        active = ActiveRun(blueprint, setup, writer, status, stop, done, pause_at=pause_at)
+        status, goes_on = _claim(blueprint, setup, writer, stop, pause_at)
+        done = Outcome(ledger, already_done=status.has_reached(pause_at), next_round=blueprint.round_in_words)
+        active = ActiveRun(blueprint, setup, writer, status, stop, done, goes_on, pause_at=pause_at)
         if active.outcome.already_done:
             yield active
             return
@@ -227,6 +236,8 @@ def _begun(
             episodes = blueprint.config.budget.episodes
             limit = "" if episodes is None else f", or of {episodes} episodes, whichever ends first"
             log.info("seed %d, budget of %d environment steps%s", status.seed, status.budget_steps, limit)
+            if goes_on:
+                log.info("%s", goes_on)
             active.raise_if_stopped()  # before Ray is started
             yield active
 
@@ -240,8 +251,10 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
         raise Interrupted(message)
 
 
-def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequests, pause_at: int) -> Status:
-    """Make the folder this run's, or recognise it as such; returns where the run stands now."""
+def _claim(
+    blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequests, pause_at: int
+) -> tuple[Status, str]:  # fmt: skip
+    """Make the folder this run's, or recognise it as such; returns where the run stands now, and where it goes on."""
     config, ledger = blueprint.config, writer.ledger
     given = blueprint.given
     now, here = time.time(), fingerprint(arithmetic_digest(), _also_decide(config), config.import_paths)
@@ -250,7 +263,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequ
         started_at=now, updated_at=now, fingerprint=here,
         identity=configs.identity(config, setup.train.digest(), setup.test.digest(), given=given),
     )  # fmt: skip
-    before, earlier = None, None
+    before, earlier, goes_on = None, None, ""
     if not _is_stillborn(ledger):
         before = writer.status = _status_before(ledger)
         earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
@@ -263,7 +276,7 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequ
         if before.has_reached(pause_at) and earlier is None:
             damage = ledger.damage() or _damage_behind(ledger)
             if not damage:
-                return before
+                return before, ""
         else:
             damage = _damaged_checkpoint(ledger)
         # Here, where no log is open yet, they are said on standard error.
@@ -277,6 +290,8 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequ
                 "version that began it"
             )
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
+        if not damage:
+            goes_on = _where_it_goes_on(ledger, before)
         status = replace(
             status, steps=before.steps, round=before.round, started_at=before.started_at,
             # Once marked, always marked: rows from then on are in the results.
@@ -288,13 +303,24 @@ def _claim(blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequ
         now_at = writer.hand_over(status, stored, within(earlier, blueprint.spec.horizon))
         status = replace(status, steps=now_at.steps, round=now_at.round)
         what = "another schedule" if earlier.budget == config.budget else "a larger budget"
-        log.info("going on under %s, from round %d", what, status.round)
+        goes_on = f"going on at {status.steps:,} steps, under {what}"
+        if now_at.checkpoint is None:
+            goes_on = f"beginning anew, under {what}: there is no checkpoint from before the end of the smaller one"
     # Before the status, which names the digests of these files.
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), given)
     if stop.sweep(ledger.stop_file):
         log.warning("%s is from before this began: it asked somebody else, and was removed", ledger.stop_file)
     writer.set_status(status)
-    return status
+    return status, goes_on
+
+
+def _where_it_goes_on(ledger: Ledger, before: Status) -> str:
+    """`going on at 18,432 steps`, of a run nothing of which is damaged; empty where that shows once it is restored."""
+    newest = next(iter(ledger.checkpoint_files()), None)
+    if newest is None:
+        return "" if before.checkpoint else "beginning anew: no checkpoint had been written"
+    # A run may have been killed between a checkpoint and the status that names it.
+    return f"going on at {before.steps:,} steps" if newest.name == before.checkpoint else ""
 
 
 def _damage_behind(ledger: Ledger) -> list[str]:

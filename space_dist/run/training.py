@@ -70,9 +70,10 @@ SCALES_ROUND = (1 << 32) - 1  # the round in which first scales are measured
 class Progress:
     """What a display shows, and a function that is given as `progress` is called with.
 
-    steps, budget_steps: environment steps.  set_size: how many of `n_instances` are selected.  train_return,
-    test_return: means of the last evaluation; None before the first.  episodes, budget_episodes: of training; None
-    where they are not limited.  seconds_left: at the pace of the last minute; None until some rounds have told that.
+    steps, budget_steps: environment steps, and those of the whole updates that fit into the budget.  set_size: how many
+    of `n_instances` are selected.  train_return, test_return: means of the last evaluation; None before the first.
+    episodes, budget_episodes: of training; the latter None where they are not limited.  seconds_left: at the pace of
+    the last minute; None until some rounds have told that.
     """
 
     steps: int
@@ -157,7 +158,6 @@ class Training:
         self._pause_at, self._change_at = pause_at, change_at
         self._curriculum_number, self._ends_curriculum = curriculum_number, ends_curriculum
         self._horizon = setup.spec.horizon
-        self._total_steps = blueprint.total_steps
         self.learner = blueprint.learner()
         self.ensemble = blueprint.ensemble()
         self._curriculum = blueprint.curriculum(setup.train, setup.test)
@@ -167,9 +167,8 @@ class Training:
         self._last_row_steps = 0
         self._time_left = TimeLeft()
         self._last_commit_round, self._commit_cost = 0, 0.0  # seconds, that the last one took to write
-        self.progress = Progress(
-            0, self._total_steps, 0.0, 0, len(setup.train), budget_episodes=self._config.budget.episodes
-        )
+        steps = blueprint.reachable_steps(self._curriculum)
+        self.progress = Progress(0, steps, 0.0, 0, len(setup.train), budget_episodes=self._config.budget.episodes)
 
     def run(self) -> None:
         """Train to the end of the budget, or as far as asked. Raises Interrupted, after a commit, if asked to stop."""
