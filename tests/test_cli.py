@@ -440,6 +440,15 @@ def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str]
     code, _, error = run(capsys, "evaluate", tmp_path, "--instances", TEST)
     told = error.replace("\n", "")
     assert (code, f"{tmp_path} holds no run: it has no status.json; {tmp_path}/s0 does" in told) == (1, True)
+    cell = tmp_path / "grid/cell"
+    for seed in range(5):
+        (cell / f"s{seed}").mkdir(parents=True)
+        (cell / f"s{seed}/status.json").touch()
+    listed = f"{cell}/s0, {cell}/s1, {cell}/s2 and 2 more"
+    for folder in (cell, cell.parent):
+        code, _, error = run(capsys, "explain", folder)
+        told = error.replace("\n", "")
+        assert (code, f"; 5 folders below it do, of which one is to be named: {listed}" in told) == (1, True)
 
 
 def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:

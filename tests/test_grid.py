@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import random
@@ -292,6 +293,10 @@ def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
         manifest.cell("kapa=4")
     with pytest.raises(ConfigError, match="no seed 7; it has 0, 1"):
         manifest.run("kappa=4", 7)
+    with pytest.raises(ConfigError, match="'kappa=4' of small has 2 seeds: choose one with --seed: 0, 1"):
+        manifest.run("kappa=4", None)
+    single = dataclasses.replace(manifest, seeds=(5,))
+    assert single.run("kappa=4", None) == Run(cell, 5)
     named = [cell for cell in manifest.cells if cell.label.startswith("k")]
     assert len(named) > 1
     said = ", ".join(f"{cell.label!r} ({cell.id})" for cell in named)

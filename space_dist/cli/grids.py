@@ -80,7 +80,10 @@ JobServer = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(help="The cluster's job server, where its storage is not seen from here."),
 ]
-Seed = Annotated[int, typer.Option(help="The run's seed.")]
+Seed = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(help="The run's seed. Default: that of the cell, if it has only one.", show_default=False),
+]
 
 _MODES = ("auto", "pool", "jobs")
 _WATCH_SECONDS = 1.0
@@ -276,7 +279,7 @@ def grid_status(
 def grid_logs(
     grid: GridPath,
     cell: Annotated[str, typer.Argument(help="A cell's label, or the start of its id.")],
-    seed: Seed,
+    seed: Seed = None,
     root: Root = None,
     follow: Annotated[
         bool, typer.Option("--follow", help="Go on until the run has ended, or nobody works on the grid.")

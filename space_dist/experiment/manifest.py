@@ -170,12 +170,16 @@ class Manifest:
         hint = f"; did you mean {begun[0].label!r}?" if begun else nearest(text, names)
         raise ConfigError(f"{self.name} has no cell {text!r}{hint} `space-dist grid status` lists them")
 
-    def run(self, cell: str, seed: int) -> Run:
-        """One run. Raises ConfigError if there is no such one."""
+    def run(self, cell: str, seed: int | None) -> Run:
+        """One run; without a seed, of a cell that has one alone. Raises ConfigError if there is no such one."""
         found = self.cell(cell)
         seeds = self.seeds_of(found)
+        shown = ", ".join(map(str, seeds[:20])) + (", ..." if len(seeds) > 20 else "")
+        if seed is None and len(seeds) == 1:
+            seed = seeds[0]
+        if seed is None:
+            raise ConfigError(f"{found.label!r} of {self.name} has {len(seeds)} seeds: choose one with --seed: {shown}")
         if seed not in seeds:
-            shown = ", ".join(map(str, seeds[:20])) + (", ..." if len(seeds) > 20 else "")
             raise ConfigError(f"{self.name} has no seed {seed}; it has {shown}")
         return Run(found, seed)
 

@@ -23,6 +23,7 @@ State = Literal["running", "interrupted", "failed", "paused", "done"]
 _MAX_STATUS_BYTES = 1 << 20
 _CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
 GOES_BACK: Final = "`train --resume` goes back to the one before it"  # behind a damaged checkpoint, where that can be
+_SHOWN = 3  # runs that a sentence names; the rest are counted
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
 
 
@@ -100,9 +101,7 @@ class Ledger:
         except FileNotFoundError:
             if not self.folder.exists():
                 raise LedgerError(_absent(self.folder)) from None
-            below = next((file.parent for file in sorted(self.folder.glob("*/status.json"))), None)
-            hint = f"; {below} does" if below else ""
-            raise LedgerError(f"{self.folder} holds no run: it has no status.json{hint}") from None
+            raise LedgerError(f"{self.folder} holds no run: it has no status.json{_below(self.folder)}") from None
         except OSError as error:
             raise LedgerError(f"{self.status_file} cannot be read: {error.strerror}") from None
         try:
@@ -226,6 +225,16 @@ def _absent(folder: Path) -> str:
     """What to say of a folder that is not there, with the nearest name beside it."""
     hint = nearest(folder.name, (other.name for other in folder.parent.glob("*/")))
     return f"{folder} does not exist{hint.removesuffix('.')}"
+
+
+def _below(folder: Path) -> str:
+    """Which runs to name instead of a folder that holds none itself: its own, or, of a grid, those of its cells."""
+    found = sorted(folder.glob("*/status.json")) or sorted(folder.glob("*/*/status.json"))
+    if len(found) < 2:
+        return "".join(f"; {file.parent} does" for file in found)
+    named = ", ".join(str(file.parent) for file in found[:_SHOWN])
+    more = f" and {len(found) - _SHOWN:,} more" if len(found) > _SHOWN else ""
+    return f"; {len(found):,} folders below it do, of which one is to be named: {named}{more}"
 
 
 def there(path: Path) -> Path:
