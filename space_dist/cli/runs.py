@@ -375,15 +375,13 @@ def _display(name: str, seed: int) -> Iterator[tuple[Callable[[Progress], None],
         rich_progress.TextColumn("[bold]{task.description}"),
         rich_progress.BarColumn(),
         rich_progress.TextColumn("{task.fields[line]}"),
-        rich_progress.TextColumn("{task.fields[left]}"),
         console=console,
     )
     with bar:
-        task = bar.add_task(f"{name} s{seed}", total=None, left="", line="reading instances and environment")
+        task = bar.add_task(f"{name} s{seed}", total=None, line="reading instances and environment")
 
         def observe(progress: Progress) -> None:
-            line, left = _in_words(progress), _time_left(progress)
-            bar.update(task, completed=progress.share, total=1.0, line=line, left=left)
+            bar.update(task, completed=progress.share, total=1.0, line=_in_words(progress))
 
         yield observe, lambda what: bar.update(task, line=what)
 
@@ -398,23 +396,21 @@ def _lines(title: str) -> tuple[Callable[[Progress], None], Callable[[str], None
         if now - said_at < _LINE_SECONDS and progress.share < 1:
             return
         said_at = now
-        say("  ".join(filter(None, (f"{title}: {_in_words(progress)}", _time_left(progress)))))
+        say(f"{title}: {_in_words(progress)}")
 
     return observe, lambda what: say(f"{title}: {what}")
 
 
-def _time_left(progress: Progress) -> str:
-    """`0:01:20 left`; nothing where that cannot be told."""
-    left = progress.seconds_left
-    return "" if left is None else f"{datetime.timedelta(seconds=round(left))} left"
-
-
 def _in_words(progress: Progress) -> str:
+    """How far a run is; what a narrow terminal may cut off, where a bar is shown as well, comes last."""
+
     def number(value: float | None) -> str:
         return "—" if value is None else f"{value:.2f}"
 
+    seconds = progress.seconds_left
+    left = "" if seconds is None else f"{datetime.timedelta(seconds=round(seconds))} left  "
     return (
-        f"{progress.so_far}  {progress.pace}  "
+        f"{progress.so_far}  {progress.pace}  {left}"
         f"set {progress.trained}  "
         f"return train {number(progress.train_return)} test {number(progress.test_return)}"
     )
