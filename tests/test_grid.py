@@ -462,6 +462,15 @@ def test_following_a_run_ends_when_nobody_works_any_more(
     assert capsys.readouterr().err.count("nobody works on the grid any more") == 2
 
 
+def test_the_log_of_a_run_that_ends_by_episodes_ends_with_these(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = dict(SMALL) | {"budget.episodes": 40}
+    grid = plan(write_grid(tmp_path, set=limits, seeds=[0]), tmp_path / "runs").grid
+    assert command(monkeypatch, "grid", "logs", grid.folder, "kappa=1") == 0
+    assert f"waiting, 0 of {SMALL['budget.steps']:,} steps, 0 of 40 episodes. " in capsys.readouterr().err
+
+
 def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:
     made = plan(write_grid(tmp_path), tmp_path / "runs")
     grid, ledger = made.grid, made.grid.ledger(made.manifest.runs()[0])

@@ -258,13 +258,15 @@ def test_train_does_what_the_command_does(tmp_path: Path, monkeypatch: pytest.Mo
     assert isinstance(run.config, RunConfig)
     with pytest.raises(LedgerError, match="does not exist"):
         space_dist.Run(tmp_path / "nowhere")
-    with pytest.raises(LedgerError, match=r"runs below it: space_dist\.report_on\(.*Run\(.*/called'\) is one"):
+    with pytest.raises(
+        LedgerError, match=r"2 folders below it do, .*/called, .*/told; space_dist\.report_on\('/.*'\) reports on"
+    ):
         space_dist.Run(tmp_path)
 
 
 def test_a_grids_folder_is_no_run_and_says_what_reads_it(tmp_path: Path) -> None:
     folder = plan(write_grid(tmp_path), tmp_path / "runs").grid.folder
-    with pytest.raises(LedgerError, match=r"a grid's, of runs: space_dist\.report_on\("):
+    with pytest.raises(LedgerError, match=r"a grid's: space_dist\.report_on\("):
         space_dist.Run(folder)
     folder = plan_search(write_tune(tmp_path, name="sought"), tmp_path / "runs").grid.folder
     with pytest.raises(LedgerError, match=r"a search's: `space-dist tune report "):

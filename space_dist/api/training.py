@@ -104,17 +104,14 @@ def _meant(folder: Path) -> str:
         if (folder / MANIFEST).is_file():
             if Grid(folder).manifest().search is not None:
                 return f"it is a search's: `space-dist tune report {shlex.quote(str(folder))}` reports on it"
-            what = "it is a grid's, of runs"
+            what = "it is a grid's: "
         elif any(folder.glob("*/status.json")):
-            what = "there are runs below it"
+            what = ""
         else:
             return ""
-        first = next(map(str, sorted(file.parent for file in folder.glob("**/status.json"))), "")
     except (OSError, LedgerError):  # not to be read, or no manifest of ours
         return ""
-    return f"{what}: space_dist.report_on({str(folder)!r}) reports on them" + (
-        f", Run({first!r}) is one" if first else ""
-    )
+    return f"{what}space_dist.report_on({str(folder)!r}) reports on all of them"
 
 
 def train(
@@ -154,7 +151,9 @@ def train(
         def waiting(what: str) -> None:
             show(f"{run.name} s{run.seed}  {what}")
 
-        outcome = launch(run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting, tell=waiting)
+        outcome = launch(
+            run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting, tell=waiting, going_on=waiting
+        )
     return Run(outcome.ledger.folder, tracking_warning=outcome.tracking_warning)
 
 

@@ -17,6 +17,7 @@ import typer
 from space_dist.cli.overview import (
     Watching,
     display,
+    episodes_of,
     print_cells,
     print_failures,
     status_json,
@@ -305,10 +306,10 @@ def grid_logs(
             warn("nobody works on the grid any more")
             break
         time.sleep(_WATCH_SECONDS)
-    warn(
-        f"{run.title}: {run_status.in_words}, {run_status.steps:,} of {run_status.budget_steps:,} steps. "
-        f"{ledger.folder}"
-    )
+    taken = f"{run_status.steps:,} of {run_status.budget_steps:,} steps"
+    if (limit := run.cell.episodes_to_take) is not None:
+        taken += f", {episodes_of(ledger):,} of {limit:,} episodes"
+    warn(f"{run.title}: {run_status.in_words}, {taken}. {ledger.folder}")
     if run_status.detail and run_status.condition != "done":
         warn(run_status.detail)
 

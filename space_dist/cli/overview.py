@@ -84,7 +84,7 @@ class _TimeLeft:
         if overview.episodes_left is None:
             what, budgets, so_far = "steps", overview.steps_left, _steps_of
         else:
-            what, budgets, so_far = "episodes", overview.episodes_left, _episodes_of
+            what, budgets, so_far = "episodes", overview.episodes_left, episodes_of
         taken = sum(so_far(self._place.ledger(run)) for run in overview.running)
         left = max(0, budgets - taken)
         if self._at_first is None:
@@ -113,7 +113,7 @@ def _steps_of(ledger: Ledger) -> int:
     return 0
 
 
-def _episodes_of(ledger: Ledger) -> int:
+def episodes_of(ledger: Ledger) -> int:
     """The same in training episodes; 0, too, of a run whose rows cannot be read now."""
     with contextlib.suppress(SpaceDistError):
         return ledger.episodes()
@@ -140,7 +140,7 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
             size = len(rows[-1]["trained"]) if rows else 0
             taken = f"{steps:>10,} of {run.cell.steps_to_take:,} steps"
             if (limit := run.cell.episodes_to_take) is not None:
-                taken += f", {_episodes_of(ledger):,} of {limit:,} episodes"
+                taken += f", {episodes_of(ledger):,} of {limit:,} episodes"
             line = f"{taken}   set {size}   test return {shown}"
         table.add_row(Text(run.title), Text(line))
     if len(overview.running) > _SHOWN_RUNS:
