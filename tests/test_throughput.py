@@ -31,6 +31,7 @@ from benchmarks.batched_vec_env import BatchedVecEnv
 from benchmarks.contenders import TASKS, Contender, specification
 from benchmarks.pic import _shown
 from benchmarks.throughput import PAIRS, WANTED, Row, _markdown, _ratio, _searched, fastest, process
+from benchmarks.tune import _fastest_stock
 
 LINE = "tests.tiny_env:make"
 
@@ -174,6 +175,8 @@ def test_what_does_not_finish_is_no_speed(monkeypatch: pytest.MonkeyPatch, capsy
         SpaceDistError, match=r"cartpole: of 2 settings that were tried none finished .* a shorter --seconds"
     ):
         fastest("cartpole", tried, 0.5)
+    with pytest.raises(SpaceDistError, match=r"do, or say which of 16 and 64 it is with --n-envs$"):
+        _fastest_stock()  # of `tune`, which has no --seconds
 
 
 def test_a_ratio_leaves_out_rounds_that_the_rival_did_not_finish() -> None:

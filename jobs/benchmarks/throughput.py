@@ -295,10 +295,12 @@ def _best_jax(task: str, seconds: float, *, members: int) -> Contender:
     return fastest(task, [replace(best, flags=flags) for flags in XLA_FLAGS], seconds)
 
 
-def fastest(task: str, contenders: Sequence[Contender], seconds: float) -> Contender:
+def fastest(
+    task: str, contenders: Sequence[Contender], seconds: float, way_out: str = "or the benchmark a shorter --seconds"
+) -> Contender:  # fmt: skip
     """The fastest in one short measurement each; one that does not get it done in a minute is none.
 
-    Raises SpaceDistError if that is so of all.
+    Raises SpaceDistError if that is so of all. way_out: what its sentence advises beside less work for the machine.
     """
     rates = {contender: measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders}
     for contender, rate in rates.items():
@@ -311,7 +313,7 @@ def fastest(task: str, contenders: Sequence[Contender], seconds: float) -> Conte
     if not any(rates.values()):
         raise SpaceDistError(
             f"{task}: of {len(rates)} settings that were tried none finished within {PATIENCE:.0f} s, its start "
-            "and warm-up included; give the machine less else to do, or the benchmark a shorter --seconds"
+            f"and warm-up included; give the machine less else to do, {way_out}"
         )
     return max(rates, key=lambda contender: rates[contender])
 

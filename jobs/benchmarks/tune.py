@@ -114,7 +114,8 @@ def tune(
 def _fastest_stock() -> int:
     """Environments of stock SB3 with our batched environment, as `throughput` chooses them for its grids."""
     tried = [Contender("sb3", vec_env="batched", n_envs=n) for n in throughput.BATCHED]
-    return throughput.fastest("pointmass", tried, TRYING).n_envs
+    way_out = f"or say which of {' and '.join(str(n) for n in throughput.BATCHED)} it is with --n-envs"
+    return throughput.fastest("pointmass", tried, TRYING, way_out).n_envs
 
 
 def _search(trials: int, seeds: int, steps: int, generation: int) -> dict[str, Any]:
