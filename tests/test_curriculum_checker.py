@@ -100,6 +100,7 @@ def test_arguments_are_passed_on_and_those_of_the_run_are_not_the_configs() -> N
     assert check(path, instances(), BOUNDS, {"share": 1.0}).faults == []
     (fault,) = check(path, instances(), BOUNDS, {"sahre": 1.0}).faults
     assert "cannot be made of the instances and curriculum.kwargs: got an unexpected keyword argument 'sahre'" in fault
+    assert fault.endswith("'sahre'; did you mean 'share'? Its own are: share")
     (fault,) = check(path, instances(), BOUNDS, {"seed": 1}).faults
     assert "curriculum.kwargs: 'seed' comes from the run" in fault
 

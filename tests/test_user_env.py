@@ -139,8 +139,38 @@ def test_arguments_reach_the_function_that_has_them() -> None:
     env = make(f"{__name__}:Measured", 1, horizon=5, scale=2.0)
     assert isinstance(env, BatchedSingles)
     assert (env.horizon, env.first.get_wrapper_attr("scale")) == (5, 2.0)
-    with pytest.raises(ConfigError, match=r"env\.kwargs: .*unexpected keyword argument 'sclae'"):
-        make(f"{__name__}:Measured", 1, horizon=5, sclae=2.0)
+
+
+def handed_on(**kwargs: Any) -> Any:
+    return Measured(**kwargs)
+
+
+class Wider(Measured):
+    """Whose own argument stands beside those that it hands on."""
+
+    def __init__(self, width: float = 1.0, **kwargs: Any) -> None:
+        super().__init__(5, **kwargs)
+        self.width = width
+
+
+@pytest.mark.parametrize(
+    ("env_id", "given", "told"),
+    [
+        (f"{__name__}:Measured", {"horizon": 5, "sclae": 2.0},
+         "'sclae'; did you mean 'scale'? Its own are: horizon, scale"),
+        (f"{__name__}:Measured", {"horizon": 5, "zzz": 2.0}, "'zzz'. Its own are: horizon, scale"),
+        (HONEST, {"horizn": 5}, "'horizn'; did you mean 'horizon'? Its own are: render_mode, horizon"),
+        (f"{__name__}:Wider", {"sclae": 2.0}, "'sclae'; did you mean 'scale'? Its own are: width, horizon, scale"),
+        (f"{__name__}:handed_on", {"horizn": 5}, "'horizn'; did you mean 'horizon'?"),
+        ("CartPole-v1", {"sutton_barto_rewrd": True}, "did you mean 'sutton_barto_reward'? Its own are: sutton_barto"),
+        ("space_dist/PointMass-v0", {"closed_gate": True}, "did you mean 'closed_gates'? Its own are: "),
+        ("space_dist/CartPole-v0", {"n_slot": 3}, "'n_slot'. Its own are: horizon, end_reward"),
+    ],
+)  # fmt: skip
+def test_an_argument_that_is_not_known_is_told_the_nearest(env_id: str, given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=r"env\.kwargs: .* cannot be made with them: .*unexpected keyword") as refusal:
+        make(env_id, 1, **given)
+    assert told in str(refusal.value)
 
 
 def several() -> Any:

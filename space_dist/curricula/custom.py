@@ -31,6 +31,7 @@ from space_dist.curricula.interface import (
 )
 from space_dist.errors import ConfigError, SpaceDistError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
+from space_dist.system import arguments
 from space_dist.system.importing import load
 
 KEY: Final = "curriculum.import"
@@ -65,13 +66,18 @@ def make_custom(
         if signature is not None:
             signature.bind(instances, **given, **kwargs)
     except TypeError as error:
+        refused = f"{where} cannot be made of the instances and curriculum.kwargs"
+        if (text := _unknown_argument(error, found, kwargs)) is not None:
+            raise ConfigError(f"{refused}: {text}") from None
         raise ConfigError(
-            f"{where} cannot be made of the instances and curriculum.kwargs: {error}. It is called with the instances, "
+            f"{refused}: {error}. It is called with the instances, "
             "then by name with seed, draws and bounds, as far as it has these parameters, and with curriculum.kwargs"
         ) from None
     try:
         own = found(instances, **given, **kwargs)
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
+        if isinstance(error, TypeError) and (told := _unknown_argument(error, found, kwargs)) is not None:
+            raise ConfigError(f"{where} cannot be made of the instances and curriculum.kwargs: {told}") from error
         text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {str(error)[:200]}"
         raise ConfigError(f"{where} cannot be made: {text}") from error
     if not isinstance(own, Curriculum):
@@ -80,6 +86,12 @@ def make_custom(
             "space_dist.curricula.Curriculum"
         )
     return Custom(own, where, instances, draws, bounds)
+
+
+def _unknown_argument(error: TypeError, found: Callable[..., Any], kwargs: Mapping[str, Any]) -> str | None:
+    """What to say of an argument in `kwargs` that a curriculum does not take; None if that is not what is wrong."""
+    own = [name for name in arguments.own_arguments(found, positional=1) if name not in _FROM_THE_RUN]
+    return arguments.told(error, kwargs, lambda word: arguments.listing(nearest(word, own), own))
 
 
 def _signature(found: Callable[..., Any]) -> inspect.Signature | None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 from space_dist.envs.antgoal import BatchedAntGoal
 from space_dist.envs.ballcatching import BatchedBallCatching
@@ -39,6 +40,7 @@ from space_dist.envs.singles import BatchedSingles
 from space_dist.envs.sparse_pointmass import BatchedSparsePointMass
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds
+from space_dist.system import arguments
 from space_dist.system.importing import load
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
@@ -84,13 +86,11 @@ def make_batched(
     where = _named(env_id)
     try:
         if _takes_slots(make, kwargs):
-            _refuse_arguments(where, make, (n_slots,), kwargs)
-            env = make(n_slots, **kwargs)
+            env = _made(env_id, make, (n_slots,), kwargs)
         else:
             own = dict(kwargs)
             horizon = None if _takes(make, "horizon") else own.pop("horizon", None)
-            _refuse_arguments(where, make, (), own)
-            env = make(**own)
+            env = _made(env_id, make, (), own)
             if isinstance(env, gym.Env):
                 # The first is here already; the others must be its equals and not itself.
                 ready = [env]
@@ -166,15 +166,36 @@ def _takes_slots(make: Callable[..., Any], kwargs: Mapping[str, Any]) -> bool:
     )
 
 
-def _refuse_arguments(
-    where: str, make: Callable[..., Any], positional: tuple[int, ...], kwargs: Mapping[str, Any]
-) -> None:
-    if not kwargs:
-        return
+def _made(
+    env_id: str | Callable[..., Any], make: Callable[..., Any], positional: tuple[int, ...], kwargs: Mapping[str, Any]
+) -> Any:  # fmt: skip
+    """What `make` makes. Raises ConfigError if it does not take these arguments."""
+    refused = f"env.kwargs: {_named(env_id).removeprefix('env.id ')} cannot be made with them"
     try:
-        inspect.signature(make).bind(*positional, **kwargs)
+        if kwargs:
+            inspect.signature(make).bind(*positional, **kwargs)
     except TypeError as error:
-        raise ConfigError(f"env.kwargs: {where.removeprefix('env.id ')} cannot be made with them: {error}") from None
+        text = _unknown_argument(error, env_id, make, len(positional), kwargs)
+        raise ConfigError(f"{refused}: {error if text is None else text}") from None
+    try:
+        return make(*positional, **kwargs)
+    except TypeError as error:  # of what takes any argument, and hands it on
+        if (text := _unknown_argument(error, env_id, make, len(positional), kwargs)) is None:
+            raise
+        raise ConfigError(f"{refused}: {text}") from error
+
+
+def _unknown_argument(
+    error: TypeError, env_id: str | Callable[..., Any], make: Callable[..., Any], positional: int,
+    kwargs: Mapping[str, Any],
+) -> str | None:  # fmt: skip
+    """What to say of an argument in `kwargs` that an environment does not take; None if that is not what is wrong."""
+    of_gymnasium = isinstance(env_id, str) and env_id not in BATCHED and env_id in gym.registry
+    entry = gym.registry[str(env_id)].entry_point if of_gymnasium else None
+    called = load_env_creator(entry) if isinstance(entry, str) else entry or make
+    own = arguments.own_arguments(called, positional=positional)
+    names = own if positional else list(dict.fromkeys([*own, "horizon"]))  # which a batch of single ones has
+    return arguments.told(error, kwargs, lambda word: arguments.listing(nearest(word, names), own and names))
 
 
 def _refuse_interface(where: str, env: Any) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from space_dist.config import LearnerConfig
 from space_dist.errors import ConfigError, SpaceDistError, nearest
 from space_dist.learner.networks import ALGORITHMS, policy_class, policy_kwargs
+from space_dist.system.arguments import listing, own_arguments, told
 from space_dist.system.importing import load as imported
 
 KEY: Final = "learner.import"
@@ -29,8 +30,6 @@ Numbers = Mapping[str, "bool | int | float"]
 _NEVER_CALLED: Final = ("learn", "collect_rollouts", "predict", "_sample_action", "_store_transition", "dump_logs")
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 _STORED_KINDS: Final = "biuf"  # of arrays: truth values, whole numbers, floats
-_BY_NAME: Final = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-_UNKNOWN: Final = re.compile(r"unexpected keyword argument '(\w+)'")
 _DEEPEST: Final = 6  # how far into an attribute's parts is looked
 
 # What checkpoints hold of every algorithm, what every round sets anew, and what only counts for SB3's own loop.
@@ -97,24 +96,12 @@ def made(algorithm: Callable[..., Any], config: LearnerConfig, *arguments: Any, 
         try:
             return algorithm(*arguments, **settings, **config.kwargs)
         except TypeError as error:
-            unknown = _UNKNOWN.search(str(error))
-            if unknown is None or unknown[1] not in config.kwargs:
+            own = [name for name in own_arguments(algorithm, base=base) if name not in taken]
+            if (text := told(error, config.kwargs, lambda word: _meant(word, own, config))) is None:
                 raise
-            hint = _meant(unknown[1], _own_arguments(algorithm, base, taken), config)
-            raise TypeError(f"{error}{hint}") from error
+            raise TypeError(text) from error
 
     return _own_code(config, "be made of learner.kwargs", called)
-
-
-def _own_arguments(algorithm: Callable[..., Any], base: type, taken: Collection[str]) -> list[str]:
-    """The arguments that a class derived from `base` has beside those that are taken, as far as it names them."""
-    line = inspect.getmro(algorithm) if isinstance(algorithm, type) else ()
-    found: dict[str, None] = {}
-    for part in line[: line.index(base)] if base in line else ():
-        if "__init__" in vars(part):
-            named = inspect.signature(vars(part)["__init__"]).parameters.values()
-            found |= {one.name: None for one in named if one.kind in _BY_NAME and one.name not in taken}
-    return list(found)
 
 
 def _meant(word: str, own: list[str], config: LearnerConfig) -> str:
@@ -123,7 +110,7 @@ def _meant(word: str, own: list[str], config: LearnerConfig) -> str:
     hint = nearest(word, [*own, *keys])
     if beside := next((name for name in keys if f" {name!r}?" in hint), None):
         hint += f" That stands beside kwargs: learner.{beside}."
-    return f"{hint} Its own are: {', '.join(own)}" if own else hint.removesuffix(".")
+    return listing(hint, own)
 
 
 def set_up(model: BaseAlgorithm, config: LearnerConfig) -> None:
