@@ -10,7 +10,7 @@ import select
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 import psutil
 import pytest
@@ -23,6 +23,9 @@ from space_dist.config import RunConfig, dump, identity, load, schema
 from space_dist.config.plain_yaml import to_yaml
 from space_dist.config.reading import from_option
 from space_dist.errors import ConfigError, with_changes
+from space_dist.experiment.grid_file import GridConfig
+from space_dist.experiment.tuning import TuneConfig
+from space_dist.slurm.profile import Profile
 from tests.config_texts import Raw, leaves, replaced
 
 FOLDER = Path(__file__).parent.parent / "configs"
@@ -405,6 +408,64 @@ def test_values_of_no_type_that_a_key_may_have_are_told_all_of_them() -> None:
                                                           "not [1]")  # fmt: skip
 
 
+# None of which is what most keys take, nor within the range of any.
+WRONG = (
+    True, -1e30, 1e30, -(10**30), 10**30, 0.5, float("nan"), float("inf"), "", "x" * 5000, "no such word", [], [[]],
+    [-1e30] * 20, ["x" * 5000] * 101, {}, {"x": [1]}, {1: 2},
+)  # fmt: skip
+OF_PYDANTIC = re.compile(r"[A-Z]\w+ (should|must) |Field required|Extra inputs|a value|valid ")
+
+
+def with_wrong_values(model: Any, whole: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """A file of this schema again and again, with each of its keys, however deep, of each wrong value."""
+    for key, field in model.model_fields.items():
+        name = field.alias or key
+        yield from ({**whole, name: value} for value in WRONG)
+        for section in sections_in(field.annotation):
+            kind = section.model_fields.get("kind")
+            kinds = {"kind": get_args(kind.annotation)[0]} if kind and field.annotation is not section else {}
+            given = whole.get(name)
+            inner = kinds or (given if isinstance(given, dict) and field.annotation is section else {})
+            for one in with_wrong_values(section, inner):
+                listed = get_origin(field.annotation) is tuple
+                named = get_origin(field.annotation) is dict
+                yield {**whole, name: [one] if listed else {"a": one} if named else one}
+
+
+def sections_in(annotation: Any) -> list[Any]:
+    if isinstance(annotation, type) and issubclass(annotation, configs.Section):
+        return [annotation]
+    return [section for part in get_args(annotation) for section in sections_in(part)]
+
+
+@pytest.mark.parametrize("model", [configs.RunConfig, GridConfig, TuneConfig, Profile])
+def test_no_wrong_value_is_told_in_pydantics_words(model: Any) -> None:
+    """Of no key of any section, whichever kind it is of, of no kind of file."""
+    whole = configs.read(SPACE) if model is configs.RunConfig else {}
+    said = set()
+    for change in with_wrong_values(model, whole):
+        try:
+            configs.check(model, change, "a.yaml")
+        except ConfigError as error:
+            said.update(str(error).splitlines())
+    assert len(said) > 100
+    assert [line for line in sorted(said) if OF_PYDANTIC.search(line)] == []
+
+
+def test_a_value_out_of_its_range_is_told_the_range() -> None:
+    assert refusal(SPACE, "seed=-1").endswith("seed: must be a whole number from 0 to 2,147,483,647, not -1")
+    assert refusal(SPACE, "learner.net_arch=[0]").endswith("net_arch.0: must be a whole number from 1 to 16,384, not 0")
+    assert refusal(SPACE, "curriculum.eta=.inf").endswith("eta: must be a finite number above 0, not inf")
+    assert refusal(SPACE, f"env.id={'x' * 301}").endswith("env.id: must be a text of 1 to 300 characters, not of 301")
+    assert refusal(SPACE, "name=5").endswith("name: must be a text, not 5; write it in quotes")
+    assert refusal(SPACE, "name=a b").endswith(
+        "name: must be a name of letters, digits, dots, underscores and hyphens, the first a letter or a digit, of at "
+        "most 100 characters, not 'a b'"
+    )
+    with pytest.raises(ConfigError, match=r"search\.a\.float: must be a list of 2 numbers, not \[1\.0\]"):
+        configs.check(TuneConfig, {"search": {"a": {"float": [1.0]}}}, "a.yaml")
+
+
 def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:
     tree = plain(SPACE)
     del tree["curriculum"], tree["instances"]
@@ -473,7 +534,8 @@ def test_a_file_that_an_override_makes_wrong_is_named_with_it(overrides: list[st
     for line in refusal(SPACE, *overrides).splitlines():
         assert line.startswith(f"{SPACE} with {named}: ")
     faulty = written(tmp_path, replaced(plain(SPACE), "learner.gamma", 2))
-    assert refusal(faulty, "learner.kind=ppo").startswith(f"{faulty}: learner.gamma: 2: ")  # which is the file's own
+    said = refusal(faulty, "learner.kind=ppo")
+    assert said == f"{faulty}: learner.gamma: must be a number from 0 to 1, not 2"  # which is the file's own
     faulty = written(tmp_path, replaced(plain(SPACE), "learner.n_steps", 1000))
     assert refusal(faulty, "learner.gamma=0.9").startswith(f"{faulty}: learner.n_steps = 1000 ")
 

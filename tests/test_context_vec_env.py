@@ -164,8 +164,8 @@ def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
          r"curriculum\.import: this key is required; as an argument it is written \*\*\{'import': \.\.\.\}\n"
          r"CurriculumCallback: curriculum\.share: unknown key\. Allowed here: kind, import, kwargs, columns\. "
          r"What a curriculum of your own takes stands in kwargs: \{'share': 0\.5\}$"),
-        (lambda: CurriculumCallback("space", eta=-1.0), r"curriculum\.eta: -1\.0: .*greater than 0"),
-        (lambda: CurriculumCallback("space", passes=0.0), "passes: 0.0: .*greater than 0"),
+        (lambda: CurriculumCallback("space", eta=-1.0), r"curriculum\.eta: must be a number above 0, not -1\.0"),
+        (lambda: CurriculumCallback("space", passes=0.0), "passes: must be a number above 0, not 0.0"),
         (lambda: CurriculumCallback().selection, r"before learn\(\) has begun"),
         (lambda: ContextVecEnv(Honest(), CONTEXTS), "env is a Honest; give the class"),
         (lambda: ContextVecEnv(Honest, CONTEXTS, 0), "n_envs must be a whole number of at least 1, not 0"),

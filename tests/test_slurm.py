@@ -424,7 +424,7 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
     assert (code, f"--out {GRID} is a file; a folder" in " ".join(said.split())) == (2, True)
     for option, value, key in (("--throttle", -1, "throttle"), ("--cells-per-task", 0, "cells_per_task")):
         code, said = run("slurm", "export", GRID, "--out", tmp_path / "none", option, value)
-        assert (code, f"space-dist: {option} {value}: {key}: {value}: Input" in said) == (2, True)
+        assert (code, f"space-dist: {option} {value}: {key}: must be a whole number from 1 to " in said) == (2, True)
     code, said = run("slurm", "export", GRID, "--out", tmp_path / "none", "--set", "partition=long", "--set", "nodes=3")
     assert (code, "--set nodes=3: nodes is for --mode cluster" in " ".join(said.split())) == (2, True)
     assert not (tmp_path / "none").exists()

@@ -6,7 +6,7 @@ import json
 import keyword
 import re
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sized
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel
@@ -57,7 +57,6 @@ NOT_HERE = (
 _TAKES_KWARGS = {EnvConfig: "the environment", CustomConfig: "a curriculum of your own"}
 _CUSTOM = "custom"
 _OWN_CURRICULUM = f"a curriculum of your own, which import names, has `kind: {_CUSTOM}`"
-_OF_ANOTHER_TYPE = ("literal_error", "int_from_float", "finite_number")  # beside bool_type, int_type, ...
 
 
 def schema(of: type[BaseModel] = RunConfig) -> Iterator[tuple[str, str, str, str]]:
@@ -133,6 +132,8 @@ def explain(
             return f"{told}. `--set '{path[0]}={{kind: NAME}}'` puts another section in place of the file's"
         return told
     options = _sections(field) if field else []
+    if kind == "missing" and isinstance(fault["loc"][-1], int):  # of a list of so many
+        return explain({**fault, "type": "too_short", "loc": fault["loc"][:-1]}, root, source, origins, data)
     if kind == "missing":
         way_out = f"; `space-dist config schema {path[-1]}` explains it" if root is RunConfig else ""
         if root is not RunConfig and keyword.iskeyword(path[-1]):  # the key is an argument, and Python's own word
@@ -162,15 +163,29 @@ def explain(
         return f"{where}: {key}: {message}, not {short(given)}"
     if given is None:
         return f"{where}: {key}: is empty; give it {_what_to_give(field, value, fault)}"
-    if is_choice(value) and (kind.endswith("_type") or kind in _OF_ANOTHER_TYPE):
-        hint = nearest(given, words_of(value)).removesuffix(".") if isinstance(given, str) else ""
-        return f"{where}: {key}: must be {wanted(value)}, not {short(given)}{hint}"
-    if kind == "literal_error" and isinstance(given, str):
+    if kind == "literal_error" and isinstance(given, str) and not is_choice(value):
         words = re.findall(r"'([^']+)'", str(context.get("expected")))
         return f"{where}: {key}: {short(given)} is not known{nearest(given, words)} Allowed: {', '.join(words)}"
-    if kind == "tuple_type":
-        return f"{where}: {key}: {short(given)}: Input should be a list"
-    return f"{where}: {key or 'the whole file'}: {short(given)}: {fault['msg']}"
+    if kind == "invalid_key" or fault["loc"][-1] == "[key]":  # of a section, or of a user's own names
+        return f"{where}: {key.removesuffix('.[key]')}: a key must be a text; write it in quotes"
+    return f"{where}: {key or 'the whole file'}: {_no_such_value(field, value, fault)}"
+
+
+def _no_such_value(field: Any, value: Any, fault: Any) -> str:
+    """What to say of a value that its key cannot have: what it must be. field, value: see `_Place`."""
+    kind, given = fault["type"], fault.get("input")
+    whole = is_choice(value) or not kind.endswith("_type")
+    words = wanted(value, field.metadata if field else (), whole=whole)
+    if kind == "finite_number":
+        words = words.replace("a number", "a finite number")
+    if "a value" in words:  # of no type that has words
+        return f"{short(given)}: {fault['msg']}"
+    if kind.endswith("too_long") and not is_choice(value) and isinstance(given, Sized):
+        return f"must be {words}, not of {len(given):,}"
+    hint = nearest(given, words_of(value)).removesuffix(".") if isinstance(given, str) else ""
+    if kind == "string_type" and not is_choice(value) and isinstance(given, int | float):
+        hint = "; write it in quotes"
+    return f"must be {words}, not {short(given)}{hint}"
 
 
 def _what_to_give(field: Any, value: Any, fault: Any) -> str:

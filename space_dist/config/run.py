@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, Self
@@ -12,18 +11,17 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 from space_dist.config.curriculum import CurriculumConfig
 from space_dist.config.learner import LearnerConfig, PPOConfig, learners_that
 from space_dist.config.sections import (
-    NAME,
     BudgetConfig,
     CheckpointConfig,
     EnvConfig,
     EvaluationConfig,
     InstancesConfig,
+    Name,
     ResourcesConfig,
     RolloutConfig,
     Section,
     TrackingConfig,
 )
-from space_dist.config.wanted import wanted
 from space_dist.errors import nearest
 
 CHANGEABLE: Final = (
@@ -73,7 +71,7 @@ class Fork(Section):
 class RunConfig(Section):
     """One run."""
 
-    name: str = Field(pattern=NAME)
+    name: Name
     """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
     """The one number from which every random number of the run comes."""
@@ -222,18 +220,10 @@ class RunConfig(Section):
             try:
                 found = self.at(change.steps)
             except ValidationError as error:
+                from space_dist.config.explaining import explain  # which knows this schema
+
                 fault = error.errors(include_url=False)[0]
-                where = ".".join(str(part) for part in fault["loc"] if part not in (self.learner.kind,))
-                what = fault["msg"]
-                if fault["input"] is None:
-                    section = getattr(self, str(fault["loc"][0]))
-                    key = type(section).model_fields.get(str(fault["loc"][-1]))
-                    what = f"is empty; give it {wanted(key.annotation, key.metadata) if key else 'keys and values'}"
-                if fault["type"] == "union_tag_invalid":
-                    known = re.findall(r"'(\w+)'", str(fault["ctx"]["expected_tags"]))
-                    tag = str(fault["ctx"]["tag"])
-                    what = f"kind: {tag!r} is not known{nearest(tag, known)} Allowed: {', '.join(known)}"
-                raise ValueError(f"schedule.{place}: {where}: {what}") from None
+                raise ValueError(explain(fault, RunConfig, f"schedule.{place}", {}, change.set)) from None
             if change.replaces_curriculum and found.n_policies != self.n_policies:
                 raise ValueError(f"schedule.{place}: curriculum.aggregate: the number of policies cannot change")
             if change.replaces_curriculum and "curriculum.of" in found.given_paths:

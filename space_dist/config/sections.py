@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from space_dist.config.tracking_uri import AUTO, checked_uri
+from space_dist.config.wanted import Words
 from space_dist.errors import nearest
 from space_dist.system.importing import why_refused
 
@@ -16,6 +17,10 @@ Sink = Literal["tensorboard", "wandb"]
 SINKS: tuple[Sink, ...] = get_args(Sink)
 _MAX_WORKERS = 4096  # as many as there may be shards
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+Name = Annotated[
+    str, Field(pattern=NAME, max_length=100),
+    Words("a name of letters, digits, dots, underscores and hyphens, the first a letter or a digit"),
+]  # fmt: skip
 
 
 class Section(BaseModel):

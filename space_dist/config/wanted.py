@@ -1,9 +1,10 @@
-"""What a key's value must be, in words: for sentences about one that is empty, or of no type that it may have."""
+"""What a key's value must be, in words: for sentences about one that is empty, or none that it may be."""
 
 from __future__ import annotations
 
 import types
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
@@ -13,12 +14,20 @@ _WORDS: Final = {
 }  # fmt: skip
 
 
-def wanted(annotation: Any, limits: Iterable[Any] = ()) -> str:
+@dataclass(frozen=True)
+class Words:
+    """Beside a text's pattern, in an annotation: what such a text is."""
+
+    words: str
+
+
+def wanted(annotation: Any, limits: Iterable[Any] = (), *, whole: bool = False) -> str:
     """`a whole number from 1 to 64, or auto`: what a value of this type is, but for null.
 
-    limits: pydantic's, as a field has them beside its annotation.
+    limits: pydantic's, as a field has them beside its annotation. whole: also how long texts and lists may be, and how
+    texts are written.
     """
-    found = list(dict.fromkeys(_alternatives(annotation, tuple(limits))))
+    found = list(dict.fromkeys(_alternatives(annotation, tuple(limits), whole)))
     if "a number" in found and "a whole number" in found:  # which is one
         found.remove("a whole number")
     return _listed(found, ", or " if " or " in "".join(found[:-1]) or " from " in "".join(found) else " or ")
@@ -51,27 +60,46 @@ def _parts(annotation: Any) -> tuple[Any, ...]:
     return get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else ()
 
 
-def _alternatives(annotation: Any, limits: tuple[Any, ...]) -> list[str]:
+def _alternatives(annotation: Any, limits: tuple[Any, ...], whole: bool) -> list[str]:
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         own = (limit for one in inner[1:] for limit in getattr(one, "metadata", [one]))
-        return _alternatives(inner[0], (*limits, *own))
+        return _alternatives(inner[0], (*limits, *own), whole)
     if origin in (Union, types.UnionType):
-        return [word for part in inner if part is not types.NoneType for word in _alternatives(part, limits)]
+        return [word for part in inner if part is not types.NoneType for word in _alternatives(part, limits, whole)]
     if origin is Literal:
         return [_listed([str(word) for word in inner], " or ")]
-    word = _WORDS.get(origin or annotation, "a value")
-    return [word + _within(limits) if (origin or annotation) in (int, float) else word]
+    if whole and (own_words := [limit.words for limit in limits if isinstance(limit, Words)]):
+        return [",".join(filter(None, (word, _as_long(limits, "characters")))) for word in own_words]
+    kind = origin or annotation
+    if kind is tuple and inner and Ellipsis not in inner:
+        return [f"a list of {len(inner)} {_WORDS.get(inner[0], 'a value').removeprefix('a ')}s"]
+    word = _WORDS.get(kind, "a value")
+    if kind in (int, float):
+        return [word + _within(limits)]
+    return [word + _as_long(limits, "characters" if kind is str else "items") if whole else word]
 
 
 def _within(limits: Iterable[Any]) -> str:
-    given = {name: getattr(limit, name) for limit in limits for name in ("ge", "gt", "le", "lt")
-             if getattr(limit, name, None) is not None}  # fmt: skip
+    given = _given(limits, ("ge", "gt", "le", "lt"))
     if {"ge", "le"} <= given.keys():
         return f" from {_number(given['ge'])} to {_number(given['le'])}"
     words = (("ge", "of at least"), ("gt", "above"), ("le", "up to"), ("lt", "below"))
     parts = [f"{word} {_number(given[name])}" for name, word in words if name in given]
     return f" {' and '.join(parts)}" if parts else ""
+
+
+def _as_long(limits: Iterable[Any], of: str) -> str:
+    given = _given(limits, ("min_length", "max_length"))
+    if len(given) == 2:
+        return f" of {given['min_length']:,} to {given['max_length']:,} {of}"
+    bound = next((f"{'least' if name == 'min_length' else 'most'} {number:,}" for name, number in given.items()), "")
+    return f" of at {bound} {of.removesuffix('s') if bound.endswith(' 1') else of}" if bound else ""
+
+
+def _given(limits: Iterable[Any], names: tuple[str, ...]) -> dict[str, Any]:
+    """What pydantic's limits say by these names; of two that say the same, the last."""
+    return {name: value for limit in limits for name in names if (value := getattr(limit, name, None)) is not None}
 
 
 def _number(limit: float) -> str:

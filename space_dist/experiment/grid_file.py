@@ -11,7 +11,7 @@ from typing import Annotated, Any, Self
 from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from space_dist import config as configs
-from space_dist.config import NAME, Mirrors, Patience, Section
+from space_dist.config import Mirrors, Name, Patience, Section
 from space_dist.errors import ConfigError, nearest
 
 MAX_SEED = 2**31 - 1
@@ -103,7 +103,7 @@ Axes = dict[str, list[Any]]
 class GridConfig(Section):
     """One grid: every combination of the axes of `grid`, times the rows of `zip`, less `exclude`, times `seeds`."""
 
-    name: str = Field(pattern=NAME)
+    name: Name
     """Name of the grid, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     extends: tuple[Annotated[str, Field(min_length=1)], ...] = Field(min_length=1, strict=False)
     """The run config (YAML) that cells start from, relative to this file; several: an axis of their own."""

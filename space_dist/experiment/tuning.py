@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from space_dist import config as configs
-from space_dist.config import NAME, Section
+from space_dist.config import Name, Section
 from space_dist.errors import ConfigError, NotPlannedError, nearest
 from space_dist.experiment.grid_file import MAX_RUNS, GridTracking, Retry, RunResources, SeedRange, Seeds
 from space_dist.experiment.manifest import MANIFEST, Grid, in_root
@@ -235,7 +235,7 @@ class Confirmation(Section):
 class TuneConfig(Section):
     """A search: `trials` settings for each of `arms`, each run with `seeds`."""
 
-    name: str = Field(pattern=NAME, max_length=100 - len(_CONFIRMED))
+    name: Name = Field(max_length=100 - len(_CONFIRMED))
     """Name of the search, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""
     extends: str = Field(min_length=1)
     """The run config (YAML) that all trials start from, relative to this file. Its `instances.test`, or that of `set`,

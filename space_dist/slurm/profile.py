@@ -13,7 +13,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from space_dist import config as configs
-from space_dist.config import NAME, Section
+from space_dist.config import Name, Section
+from space_dist.config.wanted import Words
 from space_dist.errors import nearest
 
 _MAX_WORD, _MAX_LINE, _MAX_ITEMS = 200, 1000, 50  # sbatch reads a directive into 8 KiB
@@ -75,7 +76,14 @@ def _whole_path(value: str) -> str:
 Word = Annotated[str, Field(min_length=1, max_length=_MAX_WORD), AfterValidator(_no_option)]
 Text = Annotated[str, Field(min_length=1, max_length=_MAX_LINE), AfterValidator(_no_option)]
 Line = Annotated[str, Field(min_length=1, max_length=_MAX_LINE), AfterValidator(_one_line)]
-Memory = Annotated[str, Field(pattern=_MEMORY)]
+Memory = Annotated[str, Field(pattern=_MEMORY), Words("a size like 4000M or 16G")]
+Interface = Annotated[
+    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,30}$"), Words("the name of a network interface, like ib0"),
+]  # fmt: skip
+NodesFolder = Annotated[
+    str, Field(max_length=40, pattern=r"^/"), AfterValidator(_one_line),
+    Words("a path from / on"),
+]  # fmt: skip
 MailType = Literal[
     "NONE", "BEGIN", "END", "FAIL", "REQUEUE", "ALL", "INVALID_DEPEND", "STAGE_OUT", "TIME_LIMIT", "TIME_LIMIT_90",
     "TIME_LIMIT_80", "TIME_LIMIT_50", "ARRAY_TASKS",
@@ -109,7 +117,7 @@ class Aggregation(Section):
 class Profile(Section):
     """A site's profile. Every field is optional; one without a default is written only if it is set."""
 
-    job_name: str | None = Field(default=None, pattern=NAME)
+    job_name: Name | None = None
     """Name of the jobs; null: the grid's."""
     partition: Word | None = None
     """Partition, or several separated by commas."""
@@ -186,9 +194,9 @@ class Profile(Section):
     """Lines of shell, written as they are, before anything of ours runs. Whoever writes them runs them."""
     command: tuple[Line, ...] = Field(default=("space-dist",), min_length=1, max_length=_MAX_ITEMS, strict=False)
     """How to call this package there, a word each: [python, -P, -m, space_dist.cli]."""
-    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,30}$")] | None = None
+    interface: Interface | None = None
     """Network interface of the nodes for Ray in cluster mode, like ib0; null: the one that faces the other nodes."""
-    temp: Annotated[str, Field(max_length=40, pattern=r"^/"), AfterValidator(_one_line)] = "/tmp"  # noqa: S108 - the node's own
+    temp: NodesFolder = "/tmp"  # noqa: S108 - the node's own
     """Folder on the nodes' own disks for what lives as long as a job. Short: Ray's sockets lie below it, and Linux
     allows 107 bytes for their paths."""
 
