@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from sb3_contrib import ARS, MaskablePPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecFrameStack
+from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack
 
 from space_dist.config.shipped import FOLDER
 from space_dist.errors import ConfigError, SpaceDistError
@@ -214,6 +214,52 @@ def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> No
 def test_what_cannot_be_given_is_refused(model: Callable[[], Any], callback: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
         model().learn(16, callback=CurriculumCallback(**callback))
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecCheckNan])
+def test_evaluating_on_what_is_trained_on_is_refused(wrap: Callable[[ContextVecEnv], Any]) -> None:
+    env = line_env()
+    callbacks = [CurriculumCallback("space"), EvalCallback(wrap(env), eval_freq=4, n_eval_episodes=2, verbose=0)]
+    sentence = "EvalCallback has the env that is being trained on, .*; give EvalCallback a ContextVecEnv of its own$"
+    with pytest.raises(ConfigError, match=sentence):
+        ppo(wrap(env)).learn(100, callback=callbacks)
+
+
+def test_evaluating_on_an_environment_of_its_own_changes_nothing() -> None:
+    told = []
+    for beside in ([], [EvalCallback(line_env(n_envs=1), eval_freq=4, n_eval_episodes=2, verbose=0)]):
+        model, callback = ppo(line_env()), CurriculumCallback("space")
+        model.learn(200, callback=[*beside, callback])
+        told.append((callback.values.tolist(), callback.selection.ids.tolist()))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("kind", ["ppo", "dqn"])
+@pytest.mark.parametrize("moment", ["_on_step", "_on_rollout_end", "_on_rollout_start"])
+@pytest.mark.parametrize("resets", [True, False])
+def test_whoever_uses_what_is_trained_on_is_told(kind: str, moment: str, resets: bool) -> None:
+    class Meddler(BaseCallback):
+        times = 0
+
+        def _on_step(self) -> bool:
+            return True
+
+        def meddle(self) -> bool:
+            self.times += 1
+            if self.times == 2:
+                env = self.training_env
+                if resets:
+                    env.reset()
+                env.step(np.array([env.action_space.sample() for _ in range(env.num_envs)]))
+            return True
+
+    model, meddler = made(kind), Meddler()
+    setattr(meddler, moment, meddler.meddle)
+    sentence = "another callback has reset or stepped the env that is being trained on"
+    with pytest.raises(SpaceDistError, match=sentence):
+        model.learn(400, callback=[CurriculumCallback("space"), meddler])
+    setattr(meddler, moment, lambda: True)
+    model.learn(100, callback=CurriculumCallback("space", resume=False))  # as if nothing had been
 
 
 def test_what_is_made_on_the_way_is_closed() -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from space_dist.config import check
 from space_dist.curricula import Selection
@@ -37,8 +38,9 @@ class CurriculumCallback(BaseCallback):
     curriculum tells about itself is logged as `curriculum/...` by the model's own logger.
 
     Raises ConfigError if kind or settings are wrong; and when `learn` begins, if it was given two of these, the model,
-    its environment or its instances cannot give the curriculum what it asks for, or the model remembers another
-    curriculum. Raises SpaceDistError if training diverges, or what the model remembers cannot be read.
+    its environment or its instances cannot give the curriculum what it asks for, the model remembers another
+    curriculum, or an EvalCallback beside it has the model's own environment. Raises SpaceDistError if training
+    diverges, what the model remembers cannot be read, or another callback resets or steps the environment.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class CurriculumCallback(BaseCallback):
         self._asked = check(Asked, {**asked, "round_steps": round_steps}, "CurriculumCallback")
         self._resume = resume
         self._session: Session | None = None
+        self._time: int | None = None  # where this `learn` has left the environment in its round
 
     @property
     def selection(self) -> Selection:
@@ -80,9 +83,17 @@ class CurriculumCallback(BaseCallback):
         return self._session
 
     def _on_training_start(self) -> None:
-        if (count := _curricula(self.locals.get("callback"))) > 1:
+        beside = list(_callbacks(self.locals.get("callback")))
+        if (count := sum(isinstance(one, CurriculumCallback) for one in beside)) > 1:
             raise ConfigError(f"learn was given {count} CurriculumCallbacks, and a model is trained by one curriculum")
         wrapped = Wrapped(self.model.get_env())
+        for one in beside:
+            if isinstance(one, EvalCallback) and _innermost(one.eval_env) is wrapped.env:
+                name = type(one).__name__
+                raise ConfigError(
+                    f"CurriculumCallback: {name} has the env that is being trained on, whose episodes the curriculum "
+                    f"chooses; give {name} a ContextVecEnv of its own"
+                )
         if self._session is None or not self._session.is_of(self.model, wrapped.env):
             self._session = Session(self._asked, self.model, wrapped)
             remembered = getattr(self.model, STATE, None) if self._resume else None
@@ -91,18 +102,34 @@ class CurriculumCallback(BaseCallback):
             else:
                 self._session.remember(remembered)
         self._session.wrapped = wrapped
+        self._time = None
 
     def _on_rollout_start(self) -> None:
+        self._refuse_others_steps(0)
         self._tell(self._begun.on_rollout_start())
+        self._time = self._begun.env.time
 
     def _on_step(self) -> bool:
+        self._refuse_others_steps(1)
         return True
 
     def _on_rollout_end(self) -> None:
+        self._refuse_others_steps(0)
         self._begun.on_rollout_end()
 
     def _on_training_end(self) -> None:
         self._tell(self._begun.on_training_end())
+
+    def _refuse_others_steps(self, steps: int) -> None:
+        """Refuse that the environment is elsewhere than `steps` behind where `learn` had left it."""
+        if self._time is None:
+            return
+        self._time += steps
+        if not self._begun.plays or self._begun.env.time != self._time:
+            raise SpaceDistError(
+                "CurriculumCallback: another callback has reset or stepped the env that is being trained on, whose "
+                "episodes the curriculum chooses; have it evaluate on a ContextVecEnv of its own"
+            )
 
     def _tell(self, decided: bool) -> None:
         if not decided:
@@ -118,7 +145,16 @@ class CurriculumCallback(BaseCallback):
             )
 
 
-def _curricula(callback: object) -> int:
-    """How many curricula there are in a callback, and in those that it holds."""
+def _callbacks(callback: object) -> Iterator[object]:
+    """A callback, and those that it holds."""
+    yield callback
     held = callback.callbacks if isinstance(callback, CallbackList) else [getattr(callback, "callback", None)]
-    return isinstance(callback, CurriculumCallback) + sum(_curricula(one) for one in held if one is not None)
+    for one in held:
+        if one is not None:
+            yield from _callbacks(one)
+
+
+def _innermost(env: VecEnv) -> VecEnv:
+    while isinstance(env, VecEnvWrapper):
+        env = env.venv
+    return env

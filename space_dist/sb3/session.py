@@ -286,7 +286,7 @@ class Session:
     # ---- rounds ----
 
     @property
-    def _plays(self) -> bool:
+    def plays(self) -> bool:
         """Whether the environment is in the midst of this session's round: others may have used it meanwhile."""
         return self.env.driven and self.env.plan is self._plan
 
@@ -294,9 +294,9 @@ class Session:
         """Begin a round where the last one is over; returns whether there was a decision."""
         env, decided = self.env, False
         broken = self._open and self._on_policy  # SB3 has thrown away what was collected
-        if self._plays and not broken and env.time * env.num_envs >= self._round_steps:
+        if self.plays and not broken and env.time * env.num_envs >= self._round_steps:
             decided = self._end_round()
-        begins = not self._plays or broken
+        begins = not self.plays or broken
         if begins:
             self._begin_round()
             if env.time * env.num_envs >= self._round_steps:  # it was broken off behind its last rollout
@@ -324,7 +324,7 @@ class Session:
 
     def on_training_end(self) -> bool:
         """A round ends with `learn`, unless its last rollout was broken off and will never be learnt from."""
-        if not self._plays or not self.env.time or (self._open and self._on_policy):
+        if not self.plays or not self.env.time or (self._open and self._on_policy):
             return False
         self._open = False
         decided = self._end_round()
