@@ -24,7 +24,7 @@ from space_dist.config.shipped import FOLDER
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet, read_csv
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
-from tests.faulty_env import Honest
+from tests.faulty_env import Honest, NoInfo, NoOptions, OldStep
 from tests.test_sb3 import DISCRETE, LINE, SLOTS, TARGETS, line_env, made, ppo, remembered
 
 # ---- the environment ----
@@ -39,6 +39,24 @@ class Lesson(Honest):
 
     def action_masks(self) -> NDArray[np.bool_]:
         return np.array([True, False, True])
+
+
+class Infoless(Lesson):
+    def step(self, action: Any) -> Any:
+        return (*super().step(action)[:4], 1.0)
+
+
+class NoArguments(Lesson):
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset()
+
+
+class Takes(gym.Wrapper[Any, Any, Any, Any]):
+    """Of an environment that knows no contexts itself."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.given = options
+        return self.env.reset(seed=seed)
 
 
 CONTEXTS = np.array([[0.2, 0.1], [0.3, -0.2], [0.4, 0.3]])
@@ -187,6 +205,31 @@ def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
 def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> None:
     with pytest.raises(SpaceDistError, match=sentence):
         attempt()
+
+
+@pytest.mark.parametrize("make", [NoOptions, lambda: gym.wrappers.TimeLimit(NoOptions(), 5)])
+def test_a_reset_that_takes_no_context_is_refused_at_once(make: Callable[[], Any]) -> None:
+    with pytest.raises(ConfigError, match=r"NoOptions\.reset\(\) takes no `options`; as in Gymnasium it must be reset"):
+        ContextVecEnv(make, CONTEXTS)
+    with pytest.raises(ConfigError, match=r"NoArguments\.reset\(\) takes no `seed` and no `options`; "):
+        ContextVecEnv(NoArguments, CONTEXTS)
+    ContextVecEnv(lambda: Takes(NoOptions()), CONTEXTS).reset()
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (NoInfo, r"NoInfo\.reset\(\) must return \(observation, info\), as in Gymnasium; what it returned is no tuple "
+                 "but of type ndarray$"),
+        (OldStep, r"OldStep\.step\(\) must return \(observation, reward, terminated, truncated, info\), as in "
+                  "Gymnasium; it returned 4 values$"),
+        (Infoless, r"Infoless\.step\(\) must return .*; the info that it returned is no dict but of type float$"),
+    ],
+)  # fmt: skip
+def test_what_an_environment_returns_amiss_is_told_of_its_class(make: Callable[[], Any], sentence: str) -> None:
+    env = ContextVecEnv(make, CONTEXTS)
+    with pytest.raises(SpaceDistError, match=sentence):
+        env.step(np.zeros(env.num_envs, dtype=np.int64))
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,8 @@ FAULTS = {
     "NaNs": "the observation at step 4 holds NaN",
     "InfiniteReward": "a reward at step 1 is inf",
     "TellsNowAndThen": "at the end of some episodes and not of others",
-    "NoOptions": "it takes no `seed` or no `options`",
+    "NoOptions": "NoOptions.reset() takes no `options`; as in Gymnasium it must be reset(self, *, seed=None, "
+    "options=None), and contexts come as",
     "NoInfo": "reset() must return (observation, info)",
     "OldStep": "step() must return (observation, reward, terminated, truncated, info)",
     "FailsAtTheEdge": "reset() with the context gain .* fails: KeyError: 'no such gain'",

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -126,14 +125,6 @@ class _Check:
 
     def _check_single_spaces(self, env: gym.Env[Any, Any]) -> None:
         """What a single environment returns itself: made a batch of, it would be converted."""
-        parameters = inspect.signature(env.unwrapped.reset).parameters
-        if not {"seed", "options"} <= set(parameters) and not any(
-            one.kind is one.VAR_KEYWORD for one in parameters.values()
-        ):
-            raise FaultError(
-                "reset() ignores seeds or contexts: it takes no `seed` or no `options`; Gymnasium's is "
-                "reset(self, *, seed=None, options=None)"
-            )
         given = self._contexts[0].astype(env.get_wrapper_attr("context_space").dtype)
         told = _called("reset()", lambda: env.reset(seed=int(self._seeds[0]), options={"context": given}))
         if not isinstance(told, tuple) or len(told) != 2:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +19,8 @@ from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import ContextBounds
 
 SUCCESS_KEYS = ("success", "is_success")  # of an info
+_RESET = ("observation", "info")  # what each returns in Gymnasium
+_STEP = ("observation", "reward", "terminated", "truncated", "info")
 
 
 class BatchedSingles:
@@ -43,6 +46,7 @@ class BatchedSingles:
         _refuse_observation_space(self.observation_space)
         self._context_space = _context_space(first)
         self.context_bounds = _bounds(first, self._context_space)
+        _refuse_reset(first)
         self.horizon = _horizon(first, horizon)
         self._time = np.zeros(n_slots, dtype=np.int64)
         self._observations = allocate(self.observation_space, n_slots)
@@ -72,13 +76,16 @@ class BatchedSingles:
             given = context.astype(self._context_space.dtype)
             if self.whole_contexts and (given != context).any():
                 raise SpaceDistError(f"the context {context.tolist()} must hold whole numbers, as context_space says")
-            observation, _ = self.single(slot).reset(seed=seed, options={"context": given})
-            self._keep(slot, observation)
+            env = self.single(slot)
+            told = env.reset(seed=seed, options={"context": given})
+            if not _is_told(told, _RESET):
+                raise _other_than(env, "reset", told, _RESET)
+            self._keep(slot, told[0])
         self._time[slots] = 0
         return take(self._observations, slots)
 
     def step(self, actions: NDArray[np.generic]) -> Step:
-        """One step of every environment, in slot order."""
+        """One step of every environment, in slot order. Raises SpaceDistError where one breaks its word."""
         n = self.n_slots
         rewards, success = np.empty(n), np.zeros(n, dtype=np.bool_)
         terminated, truncated = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
@@ -86,7 +93,10 @@ class BatchedSingles:
         self._time += 1
         for slot in range(n):
             action = int(actions[slot]) if actions.ndim == 1 else np.array(actions[slot])
-            observation, rewards[slot], ended, cut, info = self._envs[slot].step(action)
+            told = self._envs[slot].step(action)
+            if not _is_told(told, _STEP):
+                raise _other_than(self._envs[slot], "step", told, _STEP)
+            observation, rewards[slot], ended, cut, info = told
             self._keep(slot, observation)
             self.infos[slot] = info
             terminated[slot] = ended
@@ -179,6 +189,43 @@ def _bounds(env: gym.Env[Any, Any], space: spaces.Box) -> ContextBounds:
         return ContextBounds(names, low, high)
     except ConfigError as error:
         raise ConfigError(f"its context_space cannot be used: {error}") from None
+
+
+def _refuse_reset(env: gym.Env[Any, Any]) -> None:
+    """Refuse a `reset` that no seed or no context can be given; Gymnasium's wrappers hand on what they are given."""
+    while isinstance(env, gym.Wrapper) and type(env).__module__.partition(".")[0] == "gymnasium":
+        env = env.env
+    try:
+        parameters = inspect.signature(env.reset).parameters
+    except (TypeError, ValueError):  # written in C
+        return
+    if any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
+        return
+    missing = [f"`{name}`" for name in ("seed", "options") if name not in parameters]
+    if missing:
+        raise ConfigError(
+            f"{type(env).__name__}.reset() takes no {' and no '.join(missing)}; as in Gymnasium it must be "
+            'reset(self, *, seed=None, options=None), and contexts come as options={"context": array}'
+        )
+
+
+def _is_told(told: Any, parts: tuple[str, ...]) -> bool:
+    """Whether a call returned as many parts as it should, and an info, of which nobody reads that of `reset`."""
+    if not isinstance(told, tuple | list) or len(told) != len(parts):
+        return False
+    return isinstance(told[-1], Mapping) or (told[-1] is None and parts is _RESET)
+
+
+def _other_than(env: gym.Env[Any, Any], method: str, told: Any, parts: tuple[str, ...]) -> SpaceDistError:
+    if not isinstance(told, tuple | list):
+        found = f"what it returned is no tuple but of type {type(told).__name__}"
+    elif len(told) != len(parts):
+        found = f"it returned {len(told)} values"
+    else:
+        found = f"the info that it returned is no dict but of type {type(told[-1]).__name__}"
+    return SpaceDistError(
+        f"{type(env.unwrapped).__name__}.{method}() must return ({', '.join(parts)}), as in Gymnasium; {found}"
+    )
 
 
 def _time_limit(env: gym.Env[Any, Any]) -> int | None:
