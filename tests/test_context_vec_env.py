@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from space_dist.config.shipped import FOLDER
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.instances import InstanceSet, read_csv
 from space_dist.sb3 import ContextVecEnv, CurriculumCallback
-from tests.faulty_env import Honest, NoInfo, NoOptions, OldStep
+from tests.faulty_env import Honest, NoInfo, NoLength, NoOptions, OldStep
 from tests.test_sb3 import DISCRETE, LINE, SLOTS, TARGETS, line_env, made, ppo, remembered
 
 # ---- the environment ----
@@ -192,14 +193,31 @@ def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
         (lambda: ContextVecEnv(Honest, CONTEXTS, env_kwargs=3), "env_kwargs must be a dict, not 3"),  # type: ignore[arg-type]
         (lambda: ContextVecEnv(Honest, CONTEXTS[:, 0]), r"shape \(3,\); it needs one row an instance and 2 columns, "
                                                         "one for each of gain, drift"),
-        (lambda: ContextVecEnv(Honest, [["a", "b"]]), "instances is a list; give a CSV file"),
+        (lambda: ContextVecEnv(Honest, [["a", "b"]]), "instances: row 0 has 'a' for gain, which is no number$"),
+        (lambda: ContextVecEnv(Honest, [[0.2, 0.1], [0.2]]),  # type: ignore[list-item]
+         r"instances: row 1 is \[0\.2\]; a row is a number for each of gain, drift, in this order$"),
+        (lambda: ContextVecEnv(Honest, [{"gain": 0.2, "drift": 0.1}]),  # type: ignore[list-item]
+         r"instances: row 0 is \{'gain': 0\.2, 'drift': 0\.1\}; a row is a number for each of gain, drift, in this"),
+        (lambda: ContextVecEnv(LINE, ["a"]), "instances: row 0 has 'a' for target, which is no number$"),
+        (lambda: ContextVecEnv(Honest, None),  # type: ignore[arg-type]
+         "instances is None; give a CSV file, an InstanceSet, or an array of numbers with one row an instance$"),
+        (lambda: ContextVecEnv(Honest, 5), "instances is of type int; give a CSV file"),
+        *((lambda columns=columns: ContextVecEnv(Honest, CONTEXTS, columns=columns),
+           rf"columns must be a list of names, like \['difficulty'\], not {re.escape(repr(columns))}$")
+          for columns in ("hard", [1], None)),
+        (lambda: ContextVecEnv(Honest, CONTEXTS, columns=["gian"]), "columns: the instances have no column 'gian'; did "
+         "you mean 'gain'\\? Further columns come with a CSV file, or with an InstanceSet$"),
+        (lambda: ContextVecEnv(Lesson, CONTEXTS, env_kwargs={"horizn": 1}),
+         "^ContextVecEnv: the environment Lesson: env_kwargs: it cannot be made with them: got an unexpected keyword "
+         "argument 'horizn'; did you mean 'horizon'"),
+        (lambda: ContextVecEnv(NoLength, CONTEXTS), r'or set env_kwargs\["horizon"\]: the number of steps after which'),
         (lambda: ContextVecEnv(Honest, CONTEXTS + 1.0), r"instance 0 has gain = 1\.2, outside .* \[0\.1, 0\.5\]"),
         (lambda: ContextVecEnv(Honest, "nowhere.csv"), "nowhere.csv: there is no such file"),
         (lambda: ContextVecEnv(Honest, "shipped:instances/cartpole_trian.csv"), "shipped:instances/cartpole_trian.csv: "
          "nothing of this name comes with space_dist; did you mean 'instances/cartpole_train.csv'"),
         (lambda: ContextVecEnv(LINE, InstanceSet(np.array([0]), np.array([[0.1]]), ("goal",))),
          "features are goal, the environment's are target"),
-        (lambda: ContextVecEnv("CartPole-v1", [0.5]), "CartPole-v1.*no `context_space`"),
+        (lambda: ContextVecEnv("CartPole-v1", [0.5]), "^ContextVecEnv: env 'CartPole-v1': it has no `context_space`"),
     ],
 )  # fmt: skip
 def test_mistakes_are_sentences(attempt: Callable[[], Any], sentence: str) -> None:
@@ -303,6 +321,12 @@ def test_whoever_uses_what_is_trained_on_is_told(kind: str, moment: str, resets:
         model.learn(400, callback=[CurriculumCallback("space"), meddler])
     setattr(meddler, moment, lambda: True)
     model.learn(100, callback=CurriculumCallback("space", resume=False))  # as if nothing had been
+
+
+def test_a_feature_is_a_column_too() -> None:
+    columns = {"difficulty": np.arange(3.0)}
+    ContextVecEnv(Honest, CONTEXTS, columns=["gain"])
+    ContextVecEnv(Honest, InstanceSet(np.arange(3), CONTEXTS, ("gain", "drift"), columns), columns=("difficulty",))
 
 
 def test_what_is_made_on_the_way_is_closed() -> None:

@@ -170,7 +170,7 @@ def _made(
     env_id: str | Callable[..., Any], make: Callable[..., Any], positional: tuple[int, ...], kwargs: Mapping[str, Any]
 ) -> Any:  # fmt: skip
     """What `make` makes. Raises ConfigError if it does not take these arguments."""
-    refused = f"env.kwargs: {_named(env_id).removeprefix('env.id ')} cannot be made with them"
+    refused = "env.kwargs: it cannot be made with them"
     try:
         if kwargs:
             inspect.signature(make).bind(*positional, **kwargs)

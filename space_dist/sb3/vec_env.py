@@ -8,9 +8,10 @@ all instances. It keeps the books that `rollout.collect` keeps, so that what a c
 from __future__ import annotations
 
 import operator
+import re
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -28,13 +29,18 @@ from space_dist.curricula import Selection
 from space_dist.envs import BatchedEnv, BatchedSingles, Drawable, close, make_batched, unwrapped
 from space_dist.envs.interface import opened
 from space_dist.envs.observations import Observations, allocate, concatenate, put, take
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds, InstanceSet, read_csv
 from space_dist.rollout import EpisodeTable, Shard, Stage, Walking, another_way, endless, replayed
 from space_dist.rollout.walk import Unfinished
 
 _FREE = 1 << 32  # the first round of an environment that nobody drives; no run has so many
 _FREE_STEPS = 1024  # of such a round
+_ARGUMENTS = (  # what a config's keys are called here
+    (re.compile(r"\benv\.kwargs\.(\w+)"), r'env_kwargs["\1"]'),
+    (re.compile(r"\benv\.kwargs\b"), "env_kwargs"),
+    (re.compile(r"\benv\.id\b"), "env"),
+)
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ class ContextVecEnv(VecEnv):
     n_envs: how many episodes run at once.
     seed: with the instance and the round it decides each episode's own. SB3's `seed=` of a model takes its place.
     context_visible: whether observations end with the context, scaled from its bounds to [-1, 1].
-    columns: further columns of a CSV file, for curricula that read one.
+    columns: names of further columns of a CSV file, for curricula that read one.
     env_kwargs: arguments of the environment.
 
     While a `CurriculumCallback` trains on it, the callback chooses the instances. Otherwise episodes walk over all
@@ -123,7 +129,8 @@ class ContextVecEnv(VecEnv):
 
     def make_batched(self, n_slots: int) -> BatchedEnv:
         """Another such environment, with `n_slots` slots."""
-        return make_batched(self._env, n_slots, context_visible=self.context_visible, kwargs=self._kwargs)
+        with _told_of_arguments("ContextVecEnv: "):
+            return make_batched(self._env, n_slots, context_visible=self.context_visible, kwargs=self._kwargs)
 
     def opened(self, n_slots: int) -> AbstractContextManager[BatchedEnv]:
         """Such an environment, for as long as the context lasts."""
@@ -344,34 +351,43 @@ def _whole(given: Any, name: str, least: int) -> int:
     return number
 
 
+@contextmanager
+def _told_of_arguments(beginning: str = "") -> Iterator[None]:
+    """Have what is wrong with the environment be told of the arguments here, and not of the keys of a config."""
+    try:
+        yield
+    except ConfigError as error:
+        text = str(error)
+        for key, argument in _ARGUMENTS:
+            text = key.sub(argument, text)
+        raise ConfigError(f"{beginning}{text}") from error.__cause__
+
+
 def _instances(
     given: InstanceSet | Path | str | ArrayLike, bounds: ContextBounds, columns: Sequence[str]
 ) -> InstanceSet:
     """What was given as an instance set. Raises ConfigError if it does not belong to these bounds."""
+    listed = isinstance(columns, Collection) and not isinstance(columns, str)
+    if not listed or not all(isinstance(name, str) for name in columns):
+        raise ConfigError(f"ContextVecEnv: columns must be a list of names, like ['difficulty'], not {columns!r}")
     if isinstance(given, str | Path):
-        return read_csv(given, bounds, columns)
-    d = len(bounds.names)
+        with _told_of_arguments():
+            return read_csv(given, bounds, columns)
     if isinstance(given, InstanceSet):
         instances = given
     else:
-        try:
-            contexts = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigError(
-                f"ContextVecEnv: instances is a {type(given).__name__}; give a CSV file, an InstanceSet, or an array "
-                "of numbers with one row an instance"
-            ) from None
-        contexts = contexts[:, None] if contexts.ndim == 1 and d == 1 else contexts
-        if contexts.ndim != 2 or contexts.shape[1] != d:
-            raise ConfigError(
-                f"ContextVecEnv: instances has the shape {contexts.shape}; it needs one row an instance and {d} "
-                f"columns, one for each of {', '.join(bounds.names)}"
-            )
+        contexts = _contexts(given, bounds.names)
         instances = InstanceSet(np.arange(len(contexts)), contexts, bounds.names)
     if instances.names != bounds.names:
         raise ConfigError(
             f"ContextVecEnv: the instances' features are {', '.join(instances.names)}, the environment's are "
             f"{', '.join(bounds.names)}"
+        )
+    known = (*instances.names, *instances.columns)
+    if missing := [name for name in columns if name not in known]:
+        raise ConfigError(
+            f"ContextVecEnv: columns: the instances have no column {missing[0]!r}{nearest(missing[0], known)} Further "
+            "columns come with a CSV file, or with an InstanceSet"
         )
     outside = np.argwhere((instances.contexts < bounds.low) | (instances.contexts > bounds.high))
     if len(outside):
@@ -382,3 +398,37 @@ def _instances(
             f"{bounds.high[feature]:g}]"
         )
     return instances
+
+
+def _contexts(given: ArrayLike, names: Sequence[str]) -> NDArray[np.float64]:
+    """(n, d) what was given as rows of numbers."""
+    try:
+        contexts = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        contexts = None
+    if contexts is None or not contexts.ndim:
+        what = "None" if given is None else f"of type {type(given).__name__}"
+        wanted = "give a CSV file, an InstanceSet, or an array of numbers with one row an instance"
+        raise ConfigError(f"ContextVecEnv: instances{_fault_of_row(given, names) or f' is {what}; {wanted}'}")
+    contexts = contexts[:, None] if contexts.ndim == 1 and len(names) == 1 else contexts
+    if contexts.ndim != 2 or contexts.shape[1] != len(names):
+        raise ConfigError(
+            f"ContextVecEnv: instances has the shape {contexts.shape}; it needs one row an instance and {len(names)} "
+            f"columns, one for each of {', '.join(names)}"
+        )
+    return contexts
+
+
+def _fault_of_row(given: object, names: Sequence[str]) -> str | None:
+    """What is wrong with the first row that is not its numbers, if there are rows."""
+    for number, row in enumerate(given if isinstance(given, list | tuple | np.ndarray) else ()):
+        cells = row if isinstance(row, list | tuple | np.ndarray) else [row]
+        if isinstance(row, Mapping) or len(cells) != len(names):
+            shown = repr(row)[:80]
+            return f": row {number} is {shown}; a row is a number for each of {', '.join(names)}, in this order"
+        for name, cell in zip(names, cells, strict=True):
+            try:
+                float(cell)
+            except (TypeError, ValueError):
+                return f": row {number} has {str(cell)[:80]!r} for {name}, which is no number"
+    return None
