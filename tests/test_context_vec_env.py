@@ -183,6 +183,13 @@ def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
          r"curriculum\.import: this key is required; as an argument it is written \*\*\{'import': \.\.\.\}\n"
          r"CurriculumCallback: curriculum\.share: unknown key\. Allowed here: kind, import, kwargs, columns\. "
          r"What a curriculum of your own takes stands in kwargs: \{'share': 0\.5\}$"),
+        *((lambda path=path: CurriculumCallback("custom", **{"import": path}), sentence) for path, sentence in (
+            ("no_such:Own", "^CurriculumCallback: curriculum.import 'no_such:Own': cannot import 'no_such'"),
+            ("tests.faulty_curricula:Honset", "^CurriculumCallback: curriculum.import .* has no class 'Honset'; did "
+             "you mean 'Honest'"),
+        )),
+        *((lambda of=of: CurriculumCallback("replay", **of), "^CurriculumCallback: curriculum.kind: replay has a run "
+           "follow another, .*: train with space-dist$") for of in ({}, {"of": "runs/other"})),
         (lambda: CurriculumCallback("space", eta=-1.0), r"curriculum\.eta: must be a number above 0, not -1\.0"),
         (lambda: CurriculumCallback("space", passes=0.0), "passes: must be a number above 0, not 0.0"),
         (lambda: CurriculumCallback().selection, r"before learn\(\) has begun"),

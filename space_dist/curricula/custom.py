@@ -40,6 +40,18 @@ _STORED_KINDS: Final = "biuf"  # of arrays: truth values, whole numbers, floats
 _STORED: Final = "a state's fields are int, float, bool, None, or NumPy arrays of numbers"
 
 
+def load_maker(import_path: str) -> Callable[..., Any]:
+    """The class or function behind an import path. Raises ConfigError if there is none."""
+    module, _, name = import_path.partition(":")
+    found: Any = load(import_path, KEY)
+    if not callable(found):
+        own = [known for known, value in vars(sys.modules[module]).items()
+               if isinstance(value, type) and issubclass(value, Curriculum)]  # fmt: skip
+        raise ConfigError(f"{KEY} {import_path!r}: {module!r} has no class {name!r}{nearest(name, own)}")
+    maker: Callable[..., Any] = found
+    return maker
+
+
 def make_custom(
     import_path: str, kwargs: Mapping[str, Any], *, instances: InstanceSet, seed: int, draws: Draws,
     bounds: ContextBounds,
@@ -50,13 +62,7 @@ def make_custom(
     (of contexts), each if it has a parameter of that name; and with `kwargs`.
     Raises ConfigError if there is none, if it cannot be made so, or if what it makes is no `Curriculum`.
     """
-    where = f"{KEY} {import_path!r}"
-    module, _, name = import_path.partition(":")
-    found = load(import_path, KEY)
-    if not callable(found):
-        own = [known for known, value in vars(sys.modules[module]).items()
-               if isinstance(value, type) and issubclass(value, Curriculum)]  # fmt: skip
-        raise ConfigError(f"{where}: {module!r} has no class {name!r}{nearest(name, own)}")
+    where, found = f"{KEY} {import_path!r}", load_maker(import_path)
     signature = _signature(found)
     offered: dict[str, Any] = {"seed": seed, "draws": draws, "bounds": bounds}
     given = {each: value for each, value in offered.items() if signature is None or each in signature.parameters}

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from space_dist.config import check
+from space_dist.config import CustomConfig, check
 from space_dist.curricula import Selection
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.curricula.custom import load_maker
+from space_dist.errors import ConfigError, SpaceDistError, about
 from space_dist.sb3.script import Wrapped
 from space_dist.sb3.session import STATE, Asked, Session
 
@@ -23,8 +24,8 @@ class CurriculumCallback(BaseCallback):
     """Has a curriculum choose what a model that learns on a `ContextVecEnv` is trained on.
 
     kind: which curriculum, as `curriculum.kind` of a config: space, cspace, round_robin, fixed, random_growth, manual,
-        uniform, spdrl, vds, alp_gmm, plr, accel, learnability, procurl, learning_progress, edge or currot
-        (docs/curricula.md).
+        uniform, spdrl, vds, alp_gmm, plr, accel, learnability, procurl, learning_progress, edge, currot, watched or
+        custom (docs/curricula.md). `replay` follows a run, and is refused.
     settings: its settings, by name, as under `curriculum` of a config (`space-dist config schema` explains them).
         One of your own: `CurriculumCallback("custom", kwargs={"share": 0.5}, **{"import": "my_curriculum:Lagging"})`.
     passes: length of an iteration: as many rounds as cover this many passes over the selected instances.
@@ -55,8 +56,16 @@ class CurriculumCallback(BaseCallback):
         **settings: Any,
     ) -> None:
         super().__init__(verbose)
+        if kind == "replay":
+            raise ConfigError(
+                "CurriculumCallback: curriculum.kind: replay has a run follow another, round by round, and a script is "
+                "no run: train with space-dist"
+            )
         asked = {"curriculum": {"kind": kind, **settings}, "passes": passes, "start_states": start_states}
         self._asked = check(Asked, {**asked, "round_steps": round_steps}, "CurriculumCallback")
+        if isinstance(self._asked.curriculum, CustomConfig):
+            with about("CurriculumCallback"):
+                load_maker(self._asked.curriculum.import_path)
         self._resume = resume
         self._session: Session | None = None
         self._time: int | None = None  # where this `learn` has left the environment in its round
