@@ -322,6 +322,11 @@ def test_a_policy_acts_as_the_run_does(tmp_path: Path) -> None:
         policy.with_context(plain, np.zeros((3, 1)))
     with pytest.raises(ConfigError, match="contexts of shape"):
         policy.with_context(plain, np.zeros(4))
+    given: Any
+    for given in ({"target": 0.5}, ["a"], object()):
+        with pytest.raises(ConfigError, match="an array of a number for each of target, in this order, not "):
+            policy.with_context(plain, given)
+    assert repr(policy) == f"ActingPolicy('tests.tiny_env:make', updates: {policy.policy.version}, context: target)"
     with pytest.raises(ConfigError, match="it has no number 1"):
         space_dist.load_policy(run, number=1)
 

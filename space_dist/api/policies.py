@@ -33,6 +33,11 @@ class ActingPolicy:
         self.policy, self.spec = policy, spec
         self._random = np.random.default_rng(seed)
 
+    def __repr__(self) -> str:
+        spec = self.spec
+        shown = ", ".join(spec.context_bounds.names) if spec.context_visible else "hidden"
+        return f"ActingPolicy({spec.env_id!r}, updates: {self.policy.version:,}, context: {shown})"
+
     def predict(
         self,
         observation: Observations,
@@ -87,13 +92,13 @@ class ActingPolicy:
         """`(..., obs), (..., d)` observations as the run's policy saw them: with the context, if it is shown one.
 
         context: in environment units; it is scaled from its bounds to [-1, 1] (what lies beyond them: to the nearest of
-        them), and put behind flat observations, or beside the parts of others. Raises ConfigError for a context of
-        another length, or flat observations of one.
+        them), and put behind flat observations, or beside the parts of others. Raises ConfigError for a context that is
+        not its numbers, or of another length, or flat observations of one.
         """
         if not self.spec.context_visible:
             return observation
         bounds = self.spec.context_bounds
-        scaled = np.clip(bounds.scale(np.asarray(context, dtype=np.float64)), -1.0, 1.0).astype(np.float32)
+        scaled = np.clip(bounds.scale(_numbers(context, bounds.names)), -1.0, 1.0).astype(np.float32)
         if isinstance(self.spec.observation_space, spaces.Dict):
             parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
             return {**parts, "context": scaled}
@@ -118,6 +123,15 @@ class ActingPolicy:
             found = {name: _batch(np.asarray(observation[name]), parts[name].shape, name) for name in parts}
             return {name: batch for name, (batch, _) in found.items()}, all(one for _, one in found.values())
         return _batch(np.asarray(observation), space.shape or (), "")
+
+
+def _numbers(context: ArrayLike, names: tuple[str, ...]) -> NDArray[np.float64]:
+    try:
+        return np.asarray(context, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(
+            f"a context is an array of a number for each of {', '.join(names)}, in this order, not {repr(context)[:80]}"
+        ) from None
 
 
 def _batch(array: NDArray[Any], shape: tuple[int, ...], name: str) -> tuple[NDArray[Any], bool]:
