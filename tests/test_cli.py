@@ -281,7 +281,7 @@ def test_a_run_that_is_there_is_neither_overwritten_nor_repeated(
     code, _, error = run(capsys, *train("curriculum.eta=0.2", "budget.steps=9000", out=finished), "--resume")
     assert code == 2
     assert "curriculum.eta: 0.4 -> 0.2" in error
-    assert "budget.steps: 4096 -> 9000" in error
+    assert "budget.steps" not in error  # which may grow
     code, out, _ = run(capsys, *train(out=finished), "--resume")
     assert (code, "already done" in out) == (0, True)
     after = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
@@ -484,7 +484,7 @@ def test_evaluate_without_a_run_is_an_error(
 def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     code, _, error = run(capsys, *train(out=tmp_path / "file" / "run"))
-    assert (code, "cannot write to the run folder" in error) == (1, True)
+    assert (code, "cannot write to the run folder" in error, "--resume" in error) == (1, True, False)
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
     if os.access(locked, os.W_OK):
@@ -525,7 +525,10 @@ def test_sampled_instances_are_checked_and_never_overwritten(
 def test_a_grid_is_told_from_a_run(capsys: pytest.CaptureFixture[str]) -> None:
     grid = ROOT / "configs/grids/quickstart.yaml"
     code, _, said = run(capsys, "train", grid)
-    assert (code, said) == (2, f"space-dist: {grid} is a grid, of many runs: space-dist grid run {grid}\n")
+    assert (code, said) == (
+        2,
+        f"space-dist: {grid} is a grid, of many runs: space-dist grid run {grid} (from Python: space_dist.run_grid)\n",
+    )
     code, _, said = run(capsys, "grid", "run", CONFIG)
     assert code == 2
     assert said.startswith(f"space-dist: {CONFIG} is the config of one run: space-dist train {CONFIG}")

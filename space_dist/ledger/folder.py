@@ -23,6 +23,7 @@ State = Literal["running", "interrupted", "failed", "paused", "done"]
 _MAX_STATUS_BYTES = 1 << 20
 _CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
 GOES_BACK: Final = "`train --resume` goes back to the one before it"  # behind a damaged checkpoint, where that can be
+CONTINUES: Final = "--resume continues (from Python: resume=True)"
 _SHOWN = 3  # runs that a sentence names; the rest are counted
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
 
@@ -102,6 +103,8 @@ class Ledger:
             if not self.folder.exists():
                 raise LedgerError(_absent(self.folder)) from None
             raise LedgerError(f"{self.folder} holds no run: it has no status.json{_below(self.folder)}") from None
+        except NotADirectoryError:
+            raise LedgerError(f"{self.folder} is no run's folder: {_file_in(self.folder)} is a file") from None
         except OSError as error:
             raise LedgerError(f"{self.status_file} cannot be read: {error.strerror}") from None
         try:
@@ -225,6 +228,12 @@ def _absent(folder: Path) -> str:
     """What to say of a folder that is not there, with the nearest name beside it."""
     hint = nearest(folder.name, (other.name for other in folder.parent.glob("*/")))
     return f"{folder} does not exist{hint.removesuffix('.')}"
+
+
+def _file_in(path: Path) -> str:
+    """What of a path is a file, where a folder was expected: `it`, or the part that is."""
+    part = next((above for above in path.parents if above.is_file()), None)
+    return "it" if part is None else str(part)
 
 
 def _below(folder: Path) -> str:

@@ -188,7 +188,7 @@ class Lock:
             except TimeoutError as error:
                 raise RunLockedError(
                     f"cannot write to {self._path.parent}: {error.strerror}. What was committed is intact; once the "
-                    "lock is free, --resume continues"
+                    "lock is free, --resume continues (from Python: resume=True)"
                 ) from None
             owner = self._read(file)
             if not self._is_mine(owner):

@@ -28,7 +28,7 @@ from space_dist.ledger.checkpoint import (
     encode_checkpoint,
     rows_under,
 )
-from space_dist.ledger.folder import Ledger, State, Status, read_whole
+from space_dist.ledger.folder import CONTINUES, Ledger, State, Status, read_whole
 from space_dist.ledger.lock import Lock
 from space_dist.ledger.rows import ROW_FILES, Row, encode_row
 from space_dist.system.files import TEMPORARIES, appending, atomic_write, own_folder, read_file, why_not_own
@@ -187,7 +187,7 @@ class RunWriter:
         except OSError as error:
             raise LedgerError(
                 f"{self.ledger.folder} cannot be resumed now: {path} cannot be read ({error.strerror}). "
-                "Nothing was changed; once the cause is gone, --resume continues"
+                "Nothing was changed; once the cause is gone, " + CONTINUES
             ) from error
 
     def _point_at(self, name: str, content: bytes, checkpoint: Checkpoint) -> None:
@@ -368,7 +368,7 @@ def _refuse(folder: Path, error: OSError) -> NoReturn:
         errno.ENOTDIR: "a part of the path is a file",
         errno.EEXIST: "a file of that name is in the way",
     }.get(error.errno or 0, error.strerror or str(error))
-    raise LedgerError(
-        f"cannot write to the run folder {folder}: {what}. What was committed is intact; "
-        "once the cause is gone, --resume continues"
-    ) from error
+    left = "Nothing was begun there"
+    if os.access(folder / "status.json", os.F_OK):  # False as well where it cannot be told
+        left = f"What was committed is intact; once the cause is gone, {CONTINUES}"
+    raise LedgerError(f"cannot write to the run folder {folder}: {what}. {left}") from error

@@ -9,7 +9,7 @@ from space_dist.config import DQNConfig, RunConfig
 from space_dist.errors import ConfigError
 from space_dist.ledger import Checkpoint, Status
 
-_GROWS: Final = "the budget of a run that is there may only grow: use --out DIR for a new run"
+_GROWS: Final = "the budget of a run that is there may only grow: use --out DIR for a new run (from Python: out=DIR)"
 
 
 def is_longer(before: RunConfig, now: RunConfig) -> bool:
@@ -30,7 +30,7 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
     if reason is not None:
         raise ConfigError(
             f"budget: {old.steps:,} -> {new.steps:,} steps: {reason}, so a longer run is another from its start: "
-            "use --out DIR for it. With `init_from` it starts from this run's policy"
+            "use --out DIR for it (from Python: out=DIR). With `init_from` it starts from this run's policy"
         )
     return True
 

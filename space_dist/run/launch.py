@@ -37,7 +37,18 @@ from space_dist.errors import (
     exits_refused,
 )
 from space_dist.learner import torch_checks
-from space_dist.ledger import FORMAT, GIVEN, GOES_BACK, METRICS, Ledger, RunWriter, State, Status, decode_checkpoint
+from space_dist.ledger import (
+    CONTINUES,
+    FORMAT,
+    GIVEN,
+    GOES_BACK,
+    METRICS,
+    Ledger,
+    RunWriter,
+    State,
+    Status,
+    decode_checkpoint,
+)
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
@@ -87,15 +98,18 @@ def launch(
 
     pause_at: environment steps at which it is paused, behind the first update that is made then, to be gone on with by
     another launch; 0: nowhere. observe: told of progress. waiting: told what is waited for, before and behind that:
-    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too. going_on: told where a run
-    goes on that was there: `going on at 18,432 steps`.
+    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too. going_on: with `resume`,
+    told where a run goes on that was there, `going on at 18,432 steps`, and that one begins where none was.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
     SpaceDistError after noting it in the run's status.
     """
+    nothing_there = resume and not Ledger(folder).exists()
     with begun(config, folder, resume=resume, stop=stop, pause_at=pause_at) as active:
-        if active.goes_on:
+        if nothing_there:  # who resumes expects a run, and may have named another folder
+            going_on(f"beginning anew: there was no run in {folder}")
+        elif active.goes_on:
             going_on(active.goes_on)
         for part in active.parts():
             with _cluster(part, waiting, tell) as cluster:
@@ -246,7 +260,7 @@ def _stop_if_asked(writer: RunWriter, stop: StopRequests) -> None:
     """Stop before the first round. Raises Interrupted; what was committed by then is all there is."""
     reason = stop.signalled or stop.filed
     if reason is not None and writer.status is not None:
-        message = f"stopped by {reason} before its first round; --resume continues"
+        message = f"stopped by {reason} before its first round; {CONTINUES}"
         writer.set_status(replace(writer.status, state="interrupted", message=reason, updated_at=time.time()))
         raise Interrupted(message)
 
@@ -271,7 +285,7 @@ def _claim(
         if earlier is not None and before.checkpoint is not None and not ledger.checkpoint_files():
             raise ConfigError(
                 f"{ledger.folder}: its checkpoints were removed, and a larger budget goes on from one of them: use "
-                "--out DIR for another run. With `init_from` it starts from this one's policy"
+                "--out DIR (from Python: out=DIR) for another run. With `init_from` it starts from this one's policy"
             )
         if before.has_reached(pause_at) and earlier is None:
             damage = ledger.damage() or _damage_behind(ledger)
@@ -454,7 +468,9 @@ def _refuse_other_run(
     longer = stored.model_copy(update={"budget": config.budget})
     if identity == configs.identity(longer, *digests, given=taken) and is_longer(stored, config):
         return stored
-    changes = configs.differences(stored, config)
+    # A larger budget alone would be allowed.
+    like = longer if _may_grow(stored, config) else stored
+    changes = configs.differences(like, config) or configs.differences(stored, config)
     if taken.get("init_from") != given.get("init_from"):
         changes.append("init_from: other networks")
     if taken.get("curriculum.of") != given.get("curriculum.of"):
@@ -463,8 +479,16 @@ def _refuse_other_run(
         changes.append("instances: other contexts or ids")
     raise ConfigError(
         f"{ledger.folder} holds a run of another configuration ({'; '.join(changes)}). A run's settings cannot change "
-        "on the way: use --out DIR for a new run"
+        "on the way: use --out DIR for a new run (from Python: out=DIR)"
     )
+
+
+def _may_grow(stored: RunConfig, config: RunConfig) -> bool:
+    """Whether the budgets of two configs, whatever else differs, are no reason to refuse one after the other."""
+    try:
+        return is_longer(stored, config)
+    except ConfigError:
+        return False
 
 
 def stored_config(ledger: Ledger) -> RunConfig:
