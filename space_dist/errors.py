@@ -98,7 +98,7 @@ def with_changes(where: str, sentence: str, changes: Mapping[str, str]) -> str:
         if change in sections or any(f"{key}.".startswith(f"{change}.") or change.startswith(f"{key}.") for key in keys)
         or ((word := _value(told)) and (f"'{word}'" in sentence or ("." in word and f"/{word}" in sentence)))
     ]  # fmt: skip
-    return " with ".join([where, " ".join(named)]) if named else where
+    return " with ".join([where, " ".join(dict.fromkeys(named))]) if named else where
 
 
 def _value(told: str) -> str:

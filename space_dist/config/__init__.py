@@ -63,6 +63,7 @@ from space_dist.config.reading import (
     dump,
     from_folder,
     from_its_folder,
+    from_program,
     load,
     origins,
     parse,
@@ -86,7 +87,7 @@ from space_dist.config.sections import (
     Section,
     TrackingConfig,
 )
-from space_dist.config.shipped import about_shipped, located, shipped_files, with_what_it_names
+from space_dist.config.shipped import about_shipped, located, read_named, shipped_as, shipped_files, with_what_it_names
 
 __all__ = [
     "CHANGEABLE",
@@ -147,6 +148,7 @@ __all__ = [
     "flattened",
     "from_folder",
     "from_its_folder",
+    "from_program",
     "identity",
     "learners_that",
     "load",
@@ -156,8 +158,10 @@ __all__ = [
     "plain",
     "put",
     "read",
+    "read_named",
     "read_yaml",
     "schema",
+    "shipped_as",
     "shipped_files",
     "to_yaml",
     "told",

@@ -152,10 +152,10 @@ def explain(
         if isinstance(given, Mapping):  # a section whose keys do not go together; the message names them
             if not key:
                 return f"{with_changes(source, message, origins)}: {message}"
-            changed = " ".join(
+            changed = " ".join(dict.fromkeys(
                 origin for name, origin in origins.items()
                 if name.startswith(f"{key}.") and re.search(rf"\b{re.escape(name[len(key) + 1:])}\b", message)
-            )  # fmt: skip
+            ))  # fmt: skip
             return f"{f'{source} with {changed}' if changed else where}: {key}: {message}"
         # A value is not repeated here: a URI may hold a password.
         if isinstance(context.get("error"), UriError):

@@ -12,13 +12,14 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from space_dist.config.explaining import explain
-from space_dist.config.plain_yaml import parse_yaml, read_yaml, to_yaml
+from space_dist.config.plain_yaml import parse_yaml, to_yaml
 from space_dist.config.run import RunConfig
-from space_dist.config.shipped import PREFIX, located
+from space_dist.config.shipped import PREFIX, located, read_named
 from space_dist.errors import ConfigError
 
 _M = TypeVar("_M", bound=BaseModel)
 _CREDENTIALS = re.compile(r"//[^/\s]*@")
+_DOUBLED = re.compile(r"^(\w+): (?:\w+\.)*\1: ")  # an argument, and the key that is called as it is
 _SEED = re.compile(r"^seed: 0$", re.MULTILINE)  # a run's own: those of sections do not begin a line
 # What `slurm.profile` reads and a run does not: it is above this package, which may not import it.
 _OF_PROFILES = frozenset((
@@ -52,12 +53,11 @@ def read(path: Path, *, to_check: bool = False) -> dict[str, Any]:
     Raises ConfigError for a file of another kind, with the command that takes it. to_check: whoever asks runs nothing.
     """
     place = located(path)
-    data = read_yaml(place)
-    command = "plan" if to_check else "run"
-    if "arms" in data and "env" not in data:
-        raise ConfigError(f"{path} is a search, of many runs: space-dist tune {command} {path}")
-    if "extends" in data and "env" not in data:
-        raise ConfigError(f"{path} is a grid, of many runs: space-dist grid {command} {path}")
+    data = read_named(path)
+    if "env" not in data and not data.keys().isdisjoint(("arms", "extends")):
+        what, group, called = ("search", "tune", "run_search") if "arms" in data else ("grid", "grid", "run_grid")
+        command = f"plan {path}" if to_check else f"run {path} (from Python: space_dist.{called})"
+        raise ConfigError(f"{path} is a {what}, of many runs: space-dist {group} {command}")
     if not data.keys().isdisjoint(_OF_PROFILES) and data.keys().isdisjoint(RunConfig.model_fields.keys() - {"env"}):
         raise ConfigError(f"{path} is a SLURM profile: space-dist slurm export GRID --out DIR --profile {path}")
     from_its_folder(data, place.absolute().parent)
@@ -97,7 +97,7 @@ def check(model: type[_M], data: Mapping[str, Any], source: str, origins: Mappin
         return model.model_validate(data)
     except ValidationError as error:
         faults = [explain(fault, model, source, origins or {}, data) for fault in error.errors(include_url=False)[:10]]
-        raise ConfigError("\n".join(dict.fromkeys(faults))) from None
+        raise ConfigError("\n".join(dict.fromkeys(_DOUBLED.sub(r"\1: ", fault) for fault in faults))) from None
 
 
 def dump(config: RunConfig) -> str:
@@ -138,10 +138,31 @@ def apply_override(data: dict[str, Any], override: str) -> None:
 
 
 class _Typed(str):
-    """An override that was typed as an option of its own: `resources.workers=4`, from `--workers 4`."""
+    """An override that was told otherwise: `resources.workers=4`, from `--workers 4`, or by a program's argument."""
 
     __slots__ = ("typed",)
     typed: str
+
+
+def from_program(argument: str, key: str, value: Any) -> str:
+    """The override of a key by a plain value, as an argument of a program has it; sentences name the argument.
+
+    Raises ConfigError for what can be no key.
+    """
+    if not all(part.strip() for part in key.split(".")) or "=" in key:
+        raise ConfigError(f"{argument}: {key!r} is no key, like 'budget.steps'")
+    is_told_plainly = isinstance(value, str) and _means_itself(value)
+    override = _Typed(f"{key}={value if is_told_plainly else json.dumps(value, ensure_ascii=False)}")
+    override.typed = argument
+    return override
+
+
+def _means_itself(text: str) -> bool:
+    """Whether YAML reads a text as that text, so that it stands as a user types it."""
+    try:
+        return bool(parse_yaml(text, "") == text)
+    except ConfigError:
+        return False
 
 
 def from_option(option: str, key: str, value: object) -> str:

@@ -69,7 +69,7 @@ class Fork(Section):
 
 
 class RunConfig(Section):
-    """One run."""
+    """One run: what checking a config gives. `Run(...).config` is one, and `train` takes one. None is made by hand."""
 
     name: Name
     """Name of the configuration, in folders, tables and MLflow: letters, digits, dot, underscore, hyphen."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import re
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from space_dist.config.plain_yaml import read_yaml
 from space_dist.errors import ConfigError, nearest
@@ -43,6 +43,25 @@ def located(path: Path | str) -> Path:
     raise ConfigError(
         f"{path}: nothing of this name comes with space_dist{nearest(name, names)} `space-dist configs` lists what does"
     )
+
+
+def read_named(path: Path) -> dict[str, Any]:
+    """What a YAML file says that a user names, as `read_yaml`; the fault names the shipped file that may be meant."""
+    place = located(path)
+    if not place.exists() and (meant := shipped_as(path)):
+        raise ConfigError(f"{path} does not exist; did you mean {meant!r}?")
+    return read_yaml(place)
+
+
+def shipped_as(path: Path) -> str:
+    """`shipped:NAME` of the YAML file that is called as a path is, in the repository's `configs`; empty for none."""
+    name = path.as_posix().removeprefix("configs/")
+    if "/" in name or not name.removesuffix(".yaml"):
+        return ""
+    try:
+        return f"{PREFIX}{name}" if located(f"{PREFIX}{name}").suffix == ".yaml" else ""
+    except ConfigError:
+        return ""
 
 
 def about_shipped(file: str) -> str:

@@ -209,7 +209,7 @@ def load_grid(
     fault, and for a change of what the grid compares.
     """
     place = configs.located(path)
-    data = configs.read_yaml(place)
+    data = configs.read_named(path)
     refuse_others(data, path)
     grid = configs.check(GridConfig, data, str(path))
     _refuse_changes(grid, changes)
@@ -261,11 +261,13 @@ def refuse_others(data: Mapping[str, Any], path: Path) -> None:
     """Raise ConfigError for what is a config, and of no grid."""
     if "env" in data and "extends" not in data:
         raise ConfigError(
-            f"{path} is the config of one run: space-dist train {path}, and space-dist report with the run's folder. "
-            "A grid names it with `extends`"
+            f"{path} is the config of one run: space-dist train {path} (from Python: space_dist.train), and space-dist "
+            "report with the run's folder. A grid names it with `extends`"
         )
     if "arms" in data:
-        raise ConfigError(f"{path} is a search: space-dist tune run {path}. A grid has no `arms`")
+        raise ConfigError(
+            f"{path} is a search: space-dist tune run {path} (from Python: space_dist.run_search). A grid has no `arms`"
+        )
 
 
 def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:

@@ -332,7 +332,9 @@ def in_root(path: Path, root: Path) -> Path:
         return path
     if not Grid(root / path).manifest_file.exists():
         known = [file.parent.name for file in sorted(root.glob(f"*/{MANIFEST}"))]
-        raise ConfigError(f"{path} is neither here nor a grid in {root}{nearest(path.name, known)}".removesuffix("."))
+        meant = configs.shipped_as(path)
+        hint = f"; did you mean {meant!r}?" if meant else nearest(path.name, known)
+        raise ConfigError(f"{path} is neither here nor a grid in {root}{hint}".removesuffix("."))
     return root / path
 
 
@@ -345,16 +347,21 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
     """
     path = in_root(path, root)
     if scale != scaling.WHOLE and (path.is_dir() or path.name == MANIFEST):
-        raise ConfigError(f"{path} is frozen already, with its seeds and steps; --scale is for a grid's YAML file")
+        raise ConfigError(
+            f"{path} is frozen already, with its seeds and steps; --scale (from Python: scale) is for a grid's YAML "
+            "file"
+        )
     if changes and (path.is_dir() or path.name == MANIFEST):
-        raise ConfigError(f"{path} is frozen already, with its settings; --set is for a grid's YAML file")
+        raise ConfigError(
+            f"{path} is frozen already, with its settings; --set (from Python: overrides) is for a grid's YAML file"
+        )
     if path.is_dir():
         if not (path / MANIFEST).exists():
             raise NotPlannedError(f"{path} holds no grid: it has no {MANIFEST}")
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
-    data = configs.read_yaml(configs.located(path))
+    data = configs.read_named(path)
     refuse_others(data, path)
     config = configs.check(GridConfig, data, str(path))
     grid = Grid(root / scaling.name_of(config.name, scaling.checked(scale), changes))

@@ -445,12 +445,14 @@ def is_search(data: Mapping[str, Any]) -> bool:
 
 def load_tune(path: Path) -> TuneConfig:
     """A search's file, checked. Raises ConfigError with file and key of every fault."""
-    data = configs.read_yaml(configs.located(path))
+    data = configs.read_named(path)
     if not is_search(data):
         what = "the config of one run" if "env" in data else "a grid" if "grid" in data or "zip" in data else ""
         if what:
-            how = "train" if "env" in data else "grid run"
-            raise ConfigError(f"{path} is {what}: space-dist {how} {path}. A search has `arms`")
+            how, called = ("train", "train") if "env" in data else ("grid run", "run_grid")
+            raise ConfigError(
+                f"{path} is {what}: space-dist {how} {path} (from Python: space_dist.{called}). A search has `arms`"
+            )
     return configs.check(TuneConfig, data, str(path))
 
 

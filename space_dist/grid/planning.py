@@ -64,7 +64,8 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence
         tracking=settled(config.tracking, name),
         baseline=_baseline(path, config, list(cells.values())),
         instances={name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.contents.items())},
-        code=code_digest(), git=git_state(), scale=scale, changes=tuple(sorted(changes)), threshold=config.threshold,
+        code=code_digest(), git=git_state(), scale=scale, changes=tuple(sorted(map(str, changes))),
+        threshold=config.threshold,
     )  # fmt: skip
     before = freeze(grid, manifest, files.contents)
     now, then = ({run.key for run in one.runs()} if one else set[str]() for one in (manifest, before))
