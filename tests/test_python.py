@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import pytest
 import space_dist
 from space_dist import config as configs
 from space_dist.api import progress
+from space_dist.api.arguments import as_changes
 from space_dist.api.training import as_config
 from space_dist.config import Mirrors, RunConfig
 from space_dist.errors import ConfigError, LedgerError
@@ -335,6 +337,125 @@ def test_the_model_tells_how_contexts_are_scaled(tmp_path: Path) -> None:
     run = space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "run", progress=False)
     told = json.loads((run.folder / "model.json").read_text())["context"]
     assert (told["names"], told["low"], told["high"]) == (["target"], [-1.0], [1.0])
+
+
+# ---- arguments, and where a run may be put ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("call", "said"), [
+    (lambda: space_dist.load_policy(None), "run must be a path, not None"),  # type: ignore[arg-type]
+    (lambda: space_dist.load_policy("x", seed=-1), "seed must be a whole number from 0, not -1"),
+    (lambda: space_dist.load_policy("x", seed="x"), "seed must be a whole number from 0, not 'x'"),  # type: ignore[arg-type]
+    (lambda: space_dist.Run(None), "folder must be a path, not None"),  # type: ignore[arg-type]
+    (lambda: space_dist.GridRun(None), "folder must be a path, not None"),  # type: ignore[arg-type]
+    (lambda: space_dist.report_on(None), "paths must be a folder or a list of them, not None"),  # type: ignore[arg-type]
+    (lambda: space_dist.report_on([]), "paths must be a folder or a list of them, not []"),
+    (lambda: space_dist.run_grid(None), "grid must be a path, not None"),  # type: ignore[arg-type]
+    (lambda: space_dist.run_grid("g", scale="0.5"), "scale must be a number above 0 and at most 1, not '0.5'"),  # type: ignore[arg-type]
+    (lambda: space_dist.run_grid("g", max_parallel=0), "max_parallel must be a whole number from 1, not 0"),
+    (lambda: space_dist.run_grid("g", max_parallel="2"), "max_parallel must be a whole number from 1, not '2'"),  # type: ignore[arg-type]
+    (lambda: space_dist.run_grid("g", overrides="budget.steps=1"), "overrides must be a mapping or a list, like {"),
+    (lambda: space_dist.run_search("s", max_parallel=-1), "max_parallel must be a whole number from 1, not -1"),
+    (lambda: space_dist.train("c", progress="yes"), "progress must be True, False or a function, not 'yes'"),  # type: ignore[arg-type]
+    (lambda: space_dist.train("shipped:pointmass_space", out=""), "out must be a path, not ''"),
+    (lambda: space_dist.train("shipped:pointmass_space", seed="1"), "seed: must be a whole number from 0 to 2,147"),  # type: ignore[arg-type]
+    (lambda: space_dist.train("shipped:pointmass_space", workers="2"), "workers: must be a whole number or auto"),  # type: ignore[arg-type]
+    (lambda: space_dist.train("shipped:pointmass_space", overrides={"": 1}), "overrides: '' is no key, like"),
+    (lambda: space_dist.train("shipped:pointmass_space", overrides={"curriculum.kapa": 1}),
+     "overrides: curriculum.kapa: unknown key; did you mean 'kappa'?"),
+    (lambda: space_dist.train("shipped:quickstart"), "space-dist grid run shipped:quickstart (from Python: space_d"),
+])  # fmt: skip
+def test_an_argument_that_cannot_be_used_is_named(call: Callable[[], object], said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        call()
+    assert str(refused.value).removeprefix("shipped:quickstart is a grid, of many runs: ").startswith(said)
+
+
+def test_a_name_without_its_shipped_is_told_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for call, name in ((space_dist.train, "pointmass_space"), (space_dist.train, "configs/pointmass_space.yaml"),
+                       (space_dist.run_grid, "quickstart"), (space_dist.run_search, "goalmaze_space")):  # fmt: skip
+        meant = f"did you mean 'shipped:{name.removeprefix('configs/')}'?"
+        with pytest.raises(ConfigError, match=re.escape(meant)):
+            call(name)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    "value", [1024, 1e-5, 1e20, "space", "1", "a: b", "", " x", "yes", None, True, [8, 8], {"kind": "space"}]
+)
+def test_what_a_program_overrides_with_is_what_the_command_reads(value: object) -> None:
+    data: dict[str, Any] = {}
+    configs.apply_override(data, configs.from_program("overrides", "learner.key", value))
+    assert data == {"learner": {"key": value}}
+
+
+def test_a_grid_is_changed_by_a_mapping_as_by_the_command(tmp_path: Path) -> None:
+    path = write_grid(tmp_path)
+    told = plan(path, tmp_path / "runs", 1.0, ["learner.gamma=0.5"])
+    given = plan(path, tmp_path / "runs", 1.0, as_changes({"learner.gamma": 0.5}))
+    assert (given.grid.folder, given.manifest) == (told.grid.folder, told.manifest)
+    with pytest.raises(ConfigError, match=r"^overrides: learner.gama: .*did you mean 'gamma'"):
+        space_dist.run_grid(path, root=tmp_path / "runs", overrides={"learner.gama": 0.5}, progress=False)
+
+
+def test_a_run_is_put_into_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = config_for(tmp_path, learner_section("ppo"))
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
+    run = space_dist.train(config, out=tmp_path / "runs/tiny/s0", progress=False).folder
+    grid = plan(write_grid(tmp_path), tmp_path / "grids").grid.folder
+    for folder, said in (
+        (run.parent, "holds other runs, as .*/s0; give the run a folder of its own"),
+        (run.parents[1], "holds other runs"),
+        (grid, "holds a grid"),
+        (grid.parent, "holds the folders of grids"),
+        (run / "more", "lies inside of the run in .*/s0"),
+        (tmp_path / "run.yaml", "is a file"),
+    ):
+        before = sorted(tmp_path.rglob("*"))
+        for resume in (False, True):
+            with pytest.raises(ConfigError, match=said):
+                space_dist.train(config, out=folder, resume=resume, progress=False)
+        assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", folder) == 2
+        assert sorted(tmp_path.rglob("*")) == before
+    other = tmp_path / "other"
+    (other / "theirs").mkdir(parents=True)
+    for name in ("manifest.json", "theirs/status.json"):
+        (other / name).write_text("{}")
+    assert space_dist.train(config, out=other, progress=False).status.state == "done"
+    assert space_dist.train(config, out=other, resume=True, progress=False).status.state == "done"
+
+
+def test_who_resumes_where_nothing_is_hears_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = config_for(tmp_path, learner_section("ppo"))
+    (tmp_path / "run.yaml").write_text(configs.dump(config))
+    assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", tmp_path / "told", "--resume") == 0
+    assert f"tiny s0: beginning anew: there was no run in {tmp_path / 'told'}\n" in capsys.readouterr().out
+    assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", tmp_path / "told", "--resume") == 0
+    assert "beginning anew" not in capsys.readouterr().out
+    monkeypatch.setattr(progress, "in_notebook", lambda: False)
+    monkeypatch.setattr(progress, "_on_terminal", lambda: True)
+    space_dist.train(config, out=tmp_path / "called", resume=True)
+    assert f"tiny s0: beginning anew: there was no run in {tmp_path / 'called'}" in "".join(
+        capsys.readouterr().out.split("\n")
+    )
+
+
+def test_only_files_of_rows_are_read_as_such(tmp_path: Path) -> None:
+    run = space_dist.train(config_for(tmp_path, learner_section("ppo")), out=tmp_path / "run", progress=False)
+    assert run.rows(CURRICULUM)
+    for name, hint in (("config.yaml", ""), ("metric.jsonl", "; did you mean 'metrics.jsonl'?")):
+        said = (
+            f"'{name}' is no file of rows; there are metrics.jsonl, timing.jsonl, curriculum.jsonl, values.jsonl{hint}"
+        )
+        with pytest.raises(ConfigError, match=f"^{re.escape(said)}$"):
+            run.rows(name)
+    with pytest.raises(LedgerError, match=r"config\.yaml is no run's folder: it is a file$"):
+        space_dist.Run(run.folder / "config.yaml")
+    more = config_for(tmp_path, learner_section("ppo", n_epochs=3), budget={"steps": 8 * N_STEPS})
+    with pytest.raises(ConfigError, match=r"\(learner\.n_epochs: \d+ -> 3\)\. A run's .*\(from Python: out=DIR\)"):
+        space_dist.train(more, out=run.folder, resume=True, progress=False)
 
 
 # ---- what is shown, and what importing costs -------------------------------------------------------------------------

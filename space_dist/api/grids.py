@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from space_dist.api.arguments import Overrides, as_changes, as_limit, as_path, as_share, refuse_progress
 from space_dist.api.progress import line_of_grid, shown
 from space_dist.errors import ConfigError
 from space_dist.experiment import manifest as manifests
@@ -33,7 +34,7 @@ class GridRun:
     """
 
     def __init__(self, folder: Path | str) -> None:
-        self.grid = Grid(folder)
+        self.grid = Grid(as_path(folder, "folder"))
         self.manifest = self.grid.manifest()
 
     def __repr__(self) -> str:
@@ -76,25 +77,27 @@ def run_grid(
     root: Path | str | None = None,
     max_parallel: int | None = None,
     scale: float = scaling.WHOLE,
-    overrides: Sequence[str] = (),
+    overrides: Overrides = (),
     progress: bool | Callable[[Overview], None] = True,
 ) -> GridRun:
     """Work through a grid on this machine, as `space-dist grid run` does: what is done is skipped.
 
     grid: its YAML file, `shipped:NAME`, its folder, or its manifest.json.  root: the folder that holds grids' folders;
     None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  scale: the
-    share of a YAML file's seeds and steps, in a folder of its own (`<name>-scale-<scale>`).  overrides:
-    `KEY=VALUE` for every cell of a YAML file, in a folder of its own (`<name>-set-<digest>`).  progress: show a line
-    that changes in its place; or what is called now and then.
+    share of a YAML file's seeds and steps, in a folder of its own (`<name>-scale-<scale>`).  overrides: key -> value,
+    or `KEY=VALUE`, as of `train`, for every cell of a YAML file, in a folder of its own (`<name>-set-<digest>`).
+    progress: show a line that changes in its place; or what is called now and then.
 
     Runs that fail are noted (`GridRun.statuses`) and raise nothing. Raises ConfigError for every fault of the files,
     LedgerError if the folder cannot be written.
     """
-    base = workplace() / "runs" if root is None else lasting(Path(root), "root")
-    named = grid.folder if isinstance(grid, Grid | GridRun) else Path(grid)
+    refuse_progress(progress)
+    max_parallel, scale, changes = as_limit(max_parallel), as_share(scale, "scale"), as_changes(overrides)
+    base = workplace() / "runs" if root is None else lasting(as_path(root, "root"), "root")
+    named = grid.folder if isinstance(grid, Grid | GridRun) else as_path(grid, "grid")
     stop = StopRequests()
     with ForkServer() as server, shown(progress is True) as show:
-        place, manifest = frozen(named, base, scale, overrides)
+        place, manifest = frozen(named, base, scale, changes)
 
         def observe(overview: Overview) -> None:
             if callable(progress):

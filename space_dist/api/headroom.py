@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from space_dist import config as configs
+from space_dist.api.arguments import Overrides, as_count, as_path, refuse_progress
 from space_dist.api.grids import GridRun, run_grid
-from space_dist.api.training import Config, Overrides, as_config
+from space_dist.api.training import Config, as_config
 from space_dist.config import RunConfig
 from space_dist.curricula import decode_state
 from space_dist.curricula.watching import WatchedState
@@ -58,9 +59,12 @@ def measure_headroom(
 
     Raises ConfigError for every fault of the config, SpaceDistError if a run fails.
     """
+    refuse_progress(progress)
     settings = as_config(config, overrides)
-    folder = (workplace() / "runs" / f"{settings.name}_headroom" if out is None else Path(out)).absolute()
-    blueprint = _watched(settings, steps)
+    default = workplace() / "runs" / f"{settings.name}_headroom"
+    folder = (default if out is None else as_path(out, "out")).absolute()
+    seeds = as_count(seeds, "seeds", least=1)
+    blueprint = _watched(settings, None if steps is None else as_count(steps, "steps", least=1))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _BASE).write_text(configs.dump(blueprint.config))
     (folder / _GRID).write_text(configs.to_yaml({

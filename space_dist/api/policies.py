@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from space_dist.api.arguments import as_count, as_path
 from space_dist.envs import Observations
 from space_dist.envs.observations import rows
 from space_dist.envs.spec import EnvironmentSpec
@@ -152,10 +153,11 @@ def load_policy(run: Run | Path | str, *, number: int = 0, seed: int = 0) -> Act
     run: its folder.  number: which, where a run trains several.  seed: of the actions that are drawn.
     Raises LedgerError where there is no policy yet, and ConfigError if the environment cannot be made.
     """
-    ledger = Ledger(run if isinstance(run, str | Path) else run.folder)
+    number, seed = as_count(number, "number", least=0), as_count(seed, "seed", least=0)
+    ledger = Ledger(as_path(getattr(run, "folder", run), "run"))
     ledger.status()
     spec = spec_of(stored_config(ledger))
     policies = policies_of(policy_of(ledger, spec))
-    if not 0 <= number < len(policies):
+    if number >= len(policies):
         raise ConfigError(f"{ledger.folder} has {len(policies)} policies, counted from 0; it has no number {number}")
     return ActingPolicy(policies[number], spec, seed=seed)

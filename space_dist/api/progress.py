@@ -70,13 +70,23 @@ def in_notebook() -> bool:
     return found is not None and getattr(found, "kernel", None) is not None
 
 
+def keep(line: str, *, wanted: bool) -> None:
+    """Show a line that stays, whatever is shown later; nothing where nobody would look."""
+    if wanted and (in_notebook() or _on_terminal()):
+        print(line, flush=True)  # above what a terminal's last line is: rich sees to that
+
+
+def _on_terminal() -> bool:
+    return sys.stdout is not None and sys.stdout.isatty()
+
+
 @contextlib.contextmanager
 def shown(wanted: bool) -> Iterator[Callable[[str], None]]:
     """A function that shows a line instead of the one before; one that shows nothing where nobody would look."""
     place: _Place | None = None
     if wanted and in_notebook():
         place = _Cell()
-    elif wanted and sys.stdout is not None and sys.stdout.isatty():
+    elif wanted and _on_terminal():
         place = _Terminal()
     if place is None:
         yield lambda line: None

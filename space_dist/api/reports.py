@@ -6,11 +6,13 @@ import base64
 import csv
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from space_dist.api.arguments import as_path
 from space_dist.config import located
+from space_dist.config.quoting import short
 from space_dist.errors import ConfigError
 from space_dist.experiment.manifest import MANIFEST, find_grid
 from space_dist.ledger import find_ledgers
@@ -72,11 +74,12 @@ def report_on(
     `runs` here).  out: the folder for tables and figures; None: `report` here, or in the grid's folder.  baseline,
     threshold: of a grid: the cell to compare with, and the test return to reach.
 
-    Raises ConfigError if the grid is not given alone, and for an unknown baseline; LedgerError if there are no runs.
+    Raises ConfigError where nothing is named, if the grid is not given alone, and for an unknown baseline; LedgerError
+    if there are no runs in what is named.
     """
-    given = [located(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+    given = [located(as_path(path, "paths")) for path in _listed(paths)]
     grids = [path for path in given if is_grid(path)]
-    folder = None if out is None else Path(out)
+    folder = None if out is None else as_path(out, "out")
     if not grids:
         if baseline is not None or threshold is not None:
             raise ConfigError(f"baseline and threshold are for grids; {', '.join(map(str, given))} is none")
@@ -92,12 +95,21 @@ def report_on(
         )
     if len(given) > 1:
         raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
-    grid = find_grid(grids[0], workplace() / "runs" if root is None else Path(root))
+    grid = find_grid(grids[0], workplace() / "runs" if root is None else as_path(root, "root"))
     made = build_grid_report(grid, folder, baseline=baseline, threshold=threshold)
     return ReportView(
         made.folder, made.table, _numbers(made.folder / "cells.csv"), [*made.summary, *made.remarks], made.markdown,
         _pictures(made.markdown, made.folder),
     )  # fmt: skip
+
+
+def _listed(paths: object) -> Sequence[Path | str]:
+    """One path or several, as a list. Raises ConfigError for what is neither, and for none at all."""
+    if isinstance(paths, str | Path):
+        return [paths]
+    if not isinstance(paths, Iterable) or not (several := list(paths)):
+        raise ConfigError(f"paths must be a folder or a list of them, not {short(paths)}")
+    return several
 
 
 def is_grid(path: Path) -> bool:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from space_dist import config as configs
+from space_dist.api.arguments import Overrides, as_changes, as_path, refuse_progress, without_numpy
 from space_dist.api.policies import ActingPolicy, load_policy
-from space_dist.api.progress import line_of_run, shown
+from space_dist.api.progress import keep, line_of_run, shown
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, LedgerError, about
+from space_dist.config.quoting import short
+from space_dist.errors import ConfigError, LedgerError, about, nearest
 from space_dist.experiment.manifest import MANIFEST, Grid
-from space_dist.ledger import METRICS, Ledger, Row, Status
+from space_dist.experiment.places import run_folder
+from space_dist.ledger import METRICS, ROW_FILES, Ledger, Row, Status
 from space_dist.report import draw_learning_curve, load_run
 from space_dist.report.figures import png
 from space_dist.run.launch import launch, stored_config
@@ -25,7 +26,6 @@ from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import default_folder, lasting
 
 Config = str | Path | Mapping[str, Any] | RunConfig
-Overrides = Mapping[str, Any] | Sequence[str]
 
 _SOURCE: Final = "config"  # what a config is called in sentences that lies in no file
 
@@ -37,7 +37,7 @@ class Run:
     """
 
     def __init__(self, folder: Path | str, *, tracking_warning: str | None = None) -> None:
-        self.ledger = Ledger(folder)
+        self.ledger = Ledger(as_path(folder, "folder"))
         self.tracking_warning = tracking_warning
         try:
             self.ledger.status()
@@ -69,7 +69,14 @@ class Run:
         return stored_config(self.ledger)
 
     def rows(self, file: str = METRICS) -> list[Row]:
-        """The rows of `metrics.jsonl` (an iteration or an evaluation each), or of another file of rows."""
+        """The rows of `metrics.jsonl` (an iteration or an evaluation each), or of another file of rows.
+
+        file: `metrics.jsonl`, `timing.jsonl`, `curriculum.jsonl` (a decision each) or `values.jsonl` (what instances
+        were worth at each). Raises ConfigError for any other, and LedgerError for rows that are damaged.
+        """
+        if file not in ROW_FILES:
+            hint = nearest(str(file), ROW_FILES).removesuffix(".")
+            raise ConfigError(f"{short(file)} is no file of rows; there are {', '.join(ROW_FILES)}{hint}")
         return self.ledger.rows(file)
 
     @property
@@ -130,16 +137,18 @@ def train(
         the current folder), or a `RunConfig`.
     overrides: key -> value (`{"budget.steps": 20_000}`), or as the command's `--set` has it (`["budget.steps=20000"]`).
     seed, workers: the run's seed, and its Ray actors (0: everything in this process, without Ray).
-    out: the run's folder; None: `runs/<name>/s<seed>` here.  resume: go on with the run that is there, if any.
+    out: the run's folder, its own; None: `runs/<name>/s<seed>` here.  resume: go on with the run that is there; where
+        none is, one begins, which is said.
     progress: show a line that changes in its place, in a notebook or on a terminal; or what is called after each round.
 
-    Raises ConfigError with the key of every fault, or if the folder holds another run; Interrupted if a file `stop` in
-    the run's folder asked for that; SpaceDistError if it failed. After KeyboardInterrupt, `resume=True` goes on from
-    the last checkpoint.
+    Raises ConfigError with the key of every fault, or if the folder holds another run, a grid, or runs; Interrupted if
+    a file `stop` in the run's folder asked for that; SpaceDistError if it failed. After KeyboardInterrupt,
+    `resume=True` goes on from the last checkpoint, and from the start before the first.
     """
+    refuse_progress(progress)
     stop = StopRequests()
     run = as_config(config, overrides, seed=seed, workers=workers)
-    folder = default_folder(run.name, run.seed) if out is None else lasting(Path(out), "out")
+    folder = default_folder(run.name, run.seed) if out is None else run_folder(lasting(as_path(out, "out"), "out"))
     source = str(config) if isinstance(config, str | Path) else _SOURCE
     with about(source), shown(progress is True) as show:
 
@@ -151,8 +160,11 @@ def train(
         def waiting(what: str) -> None:
             show(f"{run.name} s{run.seed}  {what}")
 
+        def going_on(where: str) -> None:
+            keep(f"{run.name} s{run.seed}: {where}", wanted=progress is True)
+
         outcome = launch(
-            run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting, tell=waiting, going_on=waiting
+            run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting, tell=waiting, going_on=going_on
         )
     return Run(outcome.ledger.folder, tracking_warning=outcome.tracking_warning)
 
@@ -166,34 +178,16 @@ def as_config(
     elif isinstance(config, RunConfig):
         data, source = config.model_dump(mode="json"), _SOURCE
     elif isinstance(config, Mapping):
-        data, source = configs.plain(_without_numpy(config), _SOURCE), _SOURCE
+        data, source = configs.plain(without_numpy(config), _SOURCE), _SOURCE
         configs.from_its_folder(data, Path.cwd())
     else:
         raise ConfigError(f"a config is a path, a mapping or a RunConfig, not a {type(config).__name__}")
-    origins: dict[str, str] = {}
-    if isinstance(overrides, str):
-        raise ConfigError(f"overrides must be a mapping or a list, like {{'budget.steps': 20000}}, not {overrides!r}")
-    if isinstance(overrides, Mapping):
-        for key, value in configs.plain(_without_numpy(overrides), "overrides").items():
-            origins[key] = f"overrides[{key!r}]"
-            configs.put(data, key, configs.from_folder(key, value, Path.cwd()), origins[key])
-    else:
-        for override in overrides:
-            configs.apply_override(data, override)
-            origins[override.partition("=")[0].strip()] = configs.told(override)
+    changes = as_changes(overrides)
+    for change in changes:
+        configs.apply_override(data, change)
+    origins = configs.origins(changes)
     for key, given in (("seed", seed), ("resources.workers", workers)):
         if given is not None:
-            configs.put(data, key, _without_numpy(given), source)
+            configs.put(data, key, without_numpy(given), source)
             origins[key] = key.rpartition(".")[2]
     return configs.parse(data, source, origins)
-
-
-def _without_numpy(value: Any) -> Any:
-    """What Python programs write, in the words of YAML: lists for tuples and arrays, text for paths."""
-    if isinstance(value, Mapping):
-        return {key: _without_numpy(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _without_numpy(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_without_numpy(item) for item in value]
-    return str(value) if isinstance(value, Path) else value

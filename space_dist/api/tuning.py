@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from space_dist.api.arguments import as_limit, as_path, refuse_progress
 from space_dist.api.grids import GridRun, worked_through
 from space_dist.api.progress import line_of_grid, shown
 from space_dist.errors import ConfigError
@@ -41,10 +42,13 @@ def run_search(
     failed. Raises ConfigError for every fault of the files, LedgerError if the folder cannot be written, SpaceDistError
     if runs failed for reasons that say nothing of their settings.
     """
-    base = workplace() / "runs" if root is None else lasting(Path(root), "root")
+    refuse_progress(progress)
+    max_parallel = as_limit(max_parallel)
+    named = as_path(search, "search")
+    base = workplace() / "runs" if root is None else lasting(as_path(root, "root"), "root")
     stop = StopRequests()
     with ForkServer() as server, shown(progress is True) as show:
-        place = planned(Path(search), base)
+        place = planned(named, base)
 
         @contextmanager
         def observing(manifest: Manifest) -> Iterator[Callable[[Overview], None]]:

@@ -49,6 +49,7 @@ def train(
     STOP.install()
     from space_dist import config as configs
     from space_dist.config.reading import from_option
+    from space_dist.experiment.places import run_folder
     from space_dist.run.launch import launch
     from space_dist.system.workplace import default_folder, lasting
 
@@ -56,7 +57,7 @@ def train(
     settings = [from_option(*option) for option in options if option[-1] is not None]
     changes = [*(overrides or ()), *settings]
     run = configs.load(config, changes)
-    folder = lasting(out, "--out") if out is not None else default_folder(run.name, run.seed)
+    folder = run_folder(lasting(out, "--out")) if out is not None else default_folder(run.name, run.seed)
     with about(str(config), configs.origins(changes)), _display(run.name, run.seed) as (observe, waiting):
         outcome = launch(
             run, folder, resume=resume, stop=STOP, observe=observe, waiting=waiting,
