@@ -410,6 +410,7 @@ def test_a_run_is_put_into_a_folder_of_its_own(tmp_path: Path, monkeypatch: pyte
         (grid.parent, "holds the folders of grids"),
         (run / "more", "lies inside of the run in .*/s0"),
         (tmp_path / "run.yaml", "is a file"),
+        (tmp_path / ("x" * 300), "cannot be a run's folder: File name too long"),
     ):
         before = sorted(tmp_path.rglob("*"))
         for resume in (False, True):

@@ -48,7 +48,7 @@ def located(path: Path | str) -> Path:
 def read_named(path: Path) -> dict[str, Any]:
     """What a YAML file says that a user names, as `read_yaml`; the fault names the shipped file that may be meant."""
     place = located(path)
-    if not place.exists() and (meant := shipped_as(path)):
+    if (meant := shipped_as(path)) and not place.exists():
         raise ConfigError(f"{path} does not exist; did you mean {meant!r}?")
     return read_yaml(place)
 

@@ -18,13 +18,21 @@ _OWN: Final = "give the run a folder of its own"
 def run_folder(folder: Path) -> Path:
     """The folder that a user names for one run, as it is.
 
-    Raises ConfigError where it holds a grid or other runs, and where it lies within a run's: whoever reads one of them
-    would come upon the other.
+    Raises ConfigError where it holds a grid or other runs, and where it lies within a run's, as whoever reads one of
+    them would come upon the other; and where that cannot be told.
     """
+    try:
+        _refuse_others(folder)
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be a run's folder: {error.strerror}") from None
+    return folder
+
+
+def _refuse_others(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder} is a file; {_OWN}")
     if Ledger(folder).exists():  # it may go on there, wherever that is
-        return folder
+        return
     if what := _what_is_planned(folder):
         raise ConfigError(f"{folder} holds a {what}; {_OWN}")
     for above in folder.resolve().parents:
@@ -34,7 +42,6 @@ def run_folder(folder: Path) -> Path:
         raise ConfigError(f"{folder} holds other runs, as {first}; {_OWN}, or name the one that is to go on")
     if grid := next((file.parent for file in folder.glob(f"*/{MANIFEST}") if _what_is_planned(file.parent)), None):
         raise ConfigError(f"{folder} holds the folders of grids, as {grid}; {_OWN}")
-    return folder
 
 
 def _what_is_planned(folder: Path) -> str:
