@@ -137,7 +137,7 @@ def train(
         the current folder), or a `RunConfig`.
     overrides: key -> value (`{"budget.steps": 20_000}`), or as the command's `--set` has it (`["budget.steps=20000"]`).
     seed, workers: the run's seed, and its Ray actors (0: everything in this process, without Ray).
-    out: the run's folder, its own; None: `runs/<name>/s<seed>` here.  resume: go on with the run that is there; where
+    out: the run's folder; None: `runs/<name>/s<seed>` here.  resume: go on with the run that is there; where
         none is, one begins, which is said.
     progress: show a line that changes in its place, in a notebook or on a terminal; or what is called after each round.
 
