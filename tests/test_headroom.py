@@ -89,10 +89,8 @@ def test_words() -> None:
     assert verdict(measured(rare, 10)).startswith("In no part of the run draws had more than 0% of the signal")
     solved = [state([[4] * 40] * 3, [[0] * 40, [2] * 40, [4] * 40]) for _ in range(3)]
     assert "draws had 100% of the signal: on a world with such a part" in verdict(measured(solved, 10))
-    short = [state([[4] * 20] * 3, [[0] * 20, [2] * 20, [4] * 20]) for _ in range(3)]
-    assert verdict(measured(short, 10)).startswith("In no part of the run 30 instances had two episodes")
     few = [state([[4, 4]], [[2, 2]]) for _ in range(3)]  # at even odds, and far too few to say so
-    assert verdict(measured(few, 10)).startswith("In no part of the run 30 instances had two episodes")
+    assert verdict(measured(few, 10)).startswith("There are 2 instances, and fewer than 30 are too few")
     assert verdict(measured([state([[4] * 40], [[0] * 40])], 10)).startswith("Nothing succeeded")
     never = in_words(measured([state([[4, 4]], [[0, 0]])], 10))
     assert len(never) == 1
@@ -107,6 +105,24 @@ def test_words() -> None:
     )
     unknown = [state([[4, 4]], [[0, 0]], known=False)]
     assert verdict(measured(unknown, 10)).startswith("Neither")
+
+
+def test_a_bound_is_said_where_enough_instances_were_judged_in_every_part() -> None:
+    played, unplayed = [4] * 40, [4] * 20 + [1] * 20
+    won = {True: [2] * 40, False: [2] * 20 + [0] * 20}
+    for enough, said in [
+        ((True, True), "Uniform draws gave 100% (IQM over seeds) of the signal that draws at even odds"),
+        (
+            (True, False),
+            "In the 1 of 2 parts of the run in which 30 instances had two episodes, uniform draws gave 100%",
+        ),
+        ((False, False), "The first success fell within"),
+    ]:
+        runs = [state([played if one else unplayed for one in enough], [won[one] for one in enough]) for _ in range(3)]
+        words = in_words(measured(runs, 10))
+        assert words[0].startswith(said)
+        assert ("no curriculum over these instances can need less" in " ".join(words)) == all(enough)
+        assert ("these runs are too short to say what a curriculum could save" in words[-1]) == (not any(enough))
 
 
 def test_what_is_watched_by_hand() -> None:
@@ -159,7 +175,7 @@ def test_the_page_is_typed_from_its_first_block_to_its_last(
         shell.run(script, {"--seeds 5": "--seeds 2"}, answer=lambda words: command(monkeypatch, *words[1:]))
     assert len(shell.typed) == 6
     said = capsys.readouterr().out
-    assert "Uniform draws gave" in said or "Nothing succeeded" in said
+    assert any(one in " ".join(said.split()) for one in ("niform draws gave", "too short to say", "Nothing succeeded"))
     assert "6 runs, bit for bit the same" in " ".join(said.split())
     assert (clone / "runs/yoked/recorded.npz").exists()
     assert (clone / "runs/sparse_pointmass_procurl_s0_from_4096/report/report.md").exists()
@@ -198,3 +214,54 @@ def test_several_policies_are_refused(tmp_path: Path) -> None:
             overrides=["engine=population", "curriculum.aggregate=population", "learner.update=stock"],
         )  # fmt: skip
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"seeds": [0, 1]}, r"seeds must be a whole number from 1 to 1,000, not \[0, 1\]"),
+        ({"seeds": 0}, "seeds must be a whole number from 1 to 1,000, not 0"),
+        ({"seeds": True}, "seeds must be a whole number from 1 to 1,000, not True"),
+        ({"steps": "4096"}, "steps must be a whole number from 1, not '4096'"),
+        ({"steps": 2.5}, "steps must be a whole number from 1, not 2.5"),
+        ({"overrides": ["instances.train=none.csv"]}, "none.csv"),
+    ],
+)
+def test_wrong_arguments_are_named_and_leave_nothing(asked: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=said):
+        measure_headroom(SPARSE, out=tmp_path / "out", progress=False, **asked)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"status.json": "{}", "config.yaml": "name: mine\n"}, "already holds a run: --out DIR measures in another"),
+        ({"manifest.json": "{}"}, "already holds a grid:"),
+        ({"config.yaml": "name: mine\n"}, "already holds a config.yaml, of no measurement:"),
+    ],
+)
+def test_what_lies_in_its_folder_is_not_written_over(
+    files: dict[str, str], said: str, tmp_path: Path, type_in: Typed
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name, content in files.items():
+        (out / name).write_text(content)
+    done = type_in("headroom", SPARSE, "--seeds", 1, "--steps", 4096, "--out", out)
+    assert done.returncode == 2
+    assert said in " ".join(done.stderr.split())
+    assert {file.name: file.read_text() for file in out.iterdir()} == files
+
+
+def test_the_measurement_of_another_config_is_kept_and_longer_runs_are_not_another(tmp_path: Path) -> None:
+    def measure(steps: int, *changes: str) -> None:
+        measure_headroom(SPARSE, out=tmp_path, steps=steps, seeds=1, progress=False, overrides=changes)
+
+    measure(2048)
+    kept = (tmp_path / "instances.csv").read_bytes()
+    with pytest.raises(ConfigError, match=r"measurement of another config, with another learner.gamma: --out DIR"):
+        measure(2048, "learner.gamma=0.9")
+    assert (tmp_path / "instances.csv").read_bytes() == kept
+    measure(4096)
+    assert (tmp_path / "instances.csv").read_bytes() != kept

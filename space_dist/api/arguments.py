@@ -43,14 +43,15 @@ def as_path(given: object, argument: str) -> Path:
     return Path(given)
 
 
-def as_count(given: object, argument: str, *, least: int) -> int:
-    """A whole number that is not below `least`. Raises ConfigError for anything else."""
+def as_count(given: object, argument: str, *, least: int, most: int | None = None) -> int:
+    """A whole number that is not below `least`, nor above `most`. Raises ConfigError for anything else."""
     try:
         number = None if isinstance(given, bool | np.bool_) else operator.index(given)  # type: ignore[arg-type]
     except TypeError:
         number = None
-    if number is None or number < least:
-        raise ConfigError(f"{argument} must be a whole number from {least}, not {short(given)}")
+    if number is None or number < least or (most is not None and number > most):
+        end = "" if most is None else f" to {most:,}"
+        raise ConfigError(f"{argument} must be a whole number from {least}{end}, not {short(given)}")
     return number
 
 

@@ -43,6 +43,7 @@ class Headroom:
     of the instances with episodes of which none, or each, succeeded.  first: `(s,)` steps by the end of the share in
     which the first success fell; NaN: there was none.  failures: least and greatest return of an episode that failed,
     where these are not all alike: then failures teach.  judged: `(s, w)` how many instances `signal` is the mean over.
+    instances: how many there are.
     """
 
     steps: int
@@ -53,6 +54,7 @@ class Headroom:
     always: FloatArray
     first: FloatArray
     judged: FloatArray
+    instances: int
     failures: tuple[float, float] | None = None
 
     def over_all(self, measure: FloatArray) -> Interval:
@@ -99,7 +101,7 @@ def measured(states: list[WatchedState], steps: int) -> Headroom:
     """The headroom that runs of so many steps each showed."""
     rows = [_of_run(state, steps) for state in states]
     arrays: dict[str, FloatArray] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    return Headroom(steps=steps, failures=_failures(states), **arrays)
+    return Headroom(steps=steps, instances=states[0].episodes.shape[1], failures=_failures(states), **arrays)
 
 
 def _failures(states: list[WatchedState]) -> tuple[float, float] | None:
@@ -152,12 +154,7 @@ def in_words(found: Headroom) -> list[str]:
                 "first success. Whether it comes sooner is a matter of discovery: breadth, easier instances, luck."
             )
             return told
-        share = found.over_all(found.signal)
-        told.append(
-            f"Uniform draws gave {share.value:.0%}{_span(share)} (IQM over seeds) of the signal that draws at even odds would have "
-            f"given: over these {found.steps:,} steps no curriculum over these instances can need less than that share "
-            "of the steps, unless what is learned on some carries over to others."
-        )
+        told.extend(_of_signal(found))
         late = found.first[~np.isnan(found.first)]
         told.append(
             f"The first success fell within the first {np.median(late):,.0f} steps (median of the seeds that had one"
@@ -173,6 +170,44 @@ def in_words(found: Headroom) -> list[str]:
     return [*told, verdict(found)]
 
 
+def _of_signal(found: Headroom) -> list[str]:
+    """What uniform draws gave; a bound where enough was seen in every part of the run, and nothing where in none."""
+    enough = _enough(found)
+    if not enough.any():
+        return []
+    share = found.over_all(found.signal[:, enough])
+    gave = (
+        f"niform draws gave {min(1.0, share.value):.0%}{_span(share)} (IQM over seeds) of the signal that draws at even odds "
+        "would have given"
+    )
+    if not enough.all():
+        return [
+            f"In the {enough.sum()} of {len(enough)} parts of the run in which {JUDGED} instances had two episodes, u{gave}. "
+            "Of the others it says nothing, and so nothing of the whole run: --steps gives longer runs."
+        ]  # fmt: skip
+    return [
+        f"U{gave}: over these {found.steps:,} steps no curriculum over these instances can need less than that share "
+        "of the steps, unless what is learned on some carries over to others."
+    ]
+
+
+def _enough(found: Headroom) -> NDArray[np.bool_]:
+    """`(w,)` in which shares of the steps enough instances were judged, in the mean over seeds, to say anything."""
+    return np.asarray(found.judged.mean(axis=0) >= JUDGED)
+
+
+def _too_little(found: Headroom) -> str:
+    if found.instances < JUDGED:
+        return (
+            f"There are {found.instances} instances, and fewer than {JUDGED} are too few to say what a curriculum over "
+            "them could save."
+        )
+    return (
+        f"In no part of the run {JUDGED} instances had two episodes: these runs are too short to say what a curriculum "
+        "could save; --steps gives longer ones."
+    )
+
+
 def verdict(found: Headroom) -> str:
     """One sentence: whether to expect anything of a curriculum, by what was seen of it in docs/wins.md."""
     by_outcome = found.failures is None and not np.isnan(found.signal).all()
@@ -181,12 +216,10 @@ def verdict(found: Headroom) -> str:
         return "Neither success nor advantages are known: nothing can be said."
     if by_outcome and np.isnan(found.first).all():
         return "Nothing succeeded: what a curriculum could save behind the first success is not known."
-    parts = [_average(share) for share, judged in zip(found.signal.T, found.judged.T, strict=True)
-             if judged.mean() >= JUDGED]  # fmt: skip
-    if by_outcome and not parts:
-        return (
-            f"In no part of the run {JUDGED} instances had two episodes, so this says no more: --steps gives longer runs."
-        )
+    if by_outcome:
+        known = found.signal[:, _enough(found)]
+    if not known.size:
+        return _too_little(found)
     if found.over_all(known).value >= LITTLE:
         return "Most of what is drawn teaches: expect little of a curriculum here."
     if not by_outcome:
@@ -194,7 +227,7 @@ def verdict(found: Headroom) -> str:
             "Advantages differ from instance to instance, which promises nothing: on a world with a reward at every "
             "step that looked so, no curriculum was better than round robin (docs/wins.md)."
         )
-    most = min(1.0, max(parts))  # without bias, so of few episodes it may be more
+    most = min(1.0, max(_average(share) for share in known.T))  # without bias, so of few episodes it may be more
     if most >= FEW:
         return (
             f"In the part of the run where most was taught, draws had {most:.0%} of the signal: on a world with such a "
