@@ -266,6 +266,17 @@ def test_a_learners_arguments_are_told_where_they_belong(learner: str, said: str
     assert said in refusal(SPACE, f"learner={learner}")
 
 
+def test_what_a_file_says_for_another_kind_is_told_once_with_what_replaces_it() -> None:
+    said = refusal(SPACE, "learner.kind=dqn")
+    instead = (
+        "--set 'learner={kind: dqn}' puts another section in place of the file's, of which dqn has no n_epochs, no "
+    )
+    assert said.startswith(f"{SPACE} with --set learner.kind=dqn: {instead}")
+    assert "\n" not in said
+    beside = refusal(SPACE, "learner.kind=dqn", "learner.n_epochs=3")  # that one the file did not say
+    assert "--set learner.n_epochs=3: learner.n_epochs: unknown key" in beside
+
+
 def test_an_unknown_key_inside_an_unknown_section_is_put_down_to_its_override() -> None:
     assert refusal(SPACE, "budjet.steps=1").startswith("--set budjet.steps=1: budjet: unknown key")
     assert refusal(SPACE, "seed.x=1").startswith("--set seed.x=1: ")

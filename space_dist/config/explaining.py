@@ -127,10 +127,9 @@ def explain(
     if where == source and kind in ("extra_forbidden", "missing") and (of_kind := origins.get(f"{path[0]}.kind")):
         where = f"{source} with {of_kind}"  # by which the section has other keys than the file's
     if kind == "extra_forbidden":
-        told = f"{where}: {key}: unknown key{_what_is_known(path, model, root, given, data)}"
-        if where.startswith(f"{source} with "):  # what the file says of another kind
-            return f"{told}. `--set '{path[0]}={{kind: NAME}}'` puts another section in place of the file's"
-        return told
+        if where.startswith(f"{source} with ") and (told := _of_another_kind(path, model, origins, data)):
+            return f"{where}: {told}"
+        return f"{where}: {key}: unknown key{_what_is_known(path, model, root, given, data)}"
     options = _sections(field) if field else []
     if kind == "missing" and isinstance(fault["loc"][-1], int):  # of a list of so many
         return explain({**fault, "type": "too_short", "loc": fault["loc"][:-1]}, root, source, origins, data)
@@ -236,6 +235,23 @@ def _what_is_known(
     taker = _taker(model, data.get(path[0])) if isinstance(given, bool | int | float | str) else None
     way_out = "" if taker is None else f". What {taker} takes stands in kwargs: {short({key: given})}"
     return f"{hint} Allowed here: {', '.join(allowed)}{way_out}"
+
+
+def _of_another_kind(
+    path: list[str], model: type[BaseModel] | None, origins: Mapping[str, str], data: Mapping[str, Any]
+) -> str:  # fmt: skip
+    """One sentence about all that a file's section says for the kind that it had before another was set; else empty."""
+    name, section = path[0], data.get(path[0])
+    if len(path) != 2 or model is None or not isinstance(section, Mapping) or name not in RunConfig.model_fields:
+        return ""
+    own, of_all = _names(model), _names_below(name)
+    left = [key for key in section if key in of_all and key not in own and f"{name}.{key}" not in origins]
+    if path[1] not in left:
+        return ""
+    kind = section["kind"]
+    in_python = origins[f"{name}.kind"].startswith("overrides")
+    instead = f"overrides={{{name!r}: {{'kind': {kind!r}}}}}" if in_python else f"--set '{name}={{kind: {kind}}}'"
+    return f"{instead} puts another section in place of the file's, of which {kind} has no {', no '.join(left)}"
 
 
 def _of_sb3_alone(path: list[str], data: Mapping[str, Any]) -> dict[str, str]:
