@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import stat
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -96,7 +96,10 @@ class InstanceSet:
     columns: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.names, str) or not all(isinstance(name, str) for name in (*self.names, *self.columns)):
+        if not isinstance(self.columns, Mapping) or not all(isinstance(name, str) for name in self.columns):
+            raise ConfigError(f"columns are numbers by name, a word, not {_cut(repr(self.columns), 120)}")
+        listed = isinstance(self.names, Iterable) and not isinstance(self.names, str)
+        if not listed or not all(isinstance(name, str) for name in self.names):
             raise ConfigError(f"names of features are a tuple of words, not {self.names!r}")
         object.__setattr__(self, "names", tuple(self.names))
         _check_names((*self.names, *self.columns))
@@ -172,8 +175,11 @@ class InstanceSet:
         Raises ConfigError if a position is doubled, no whole number or not there, or none is given.
         """
         chosen = np.asarray(indices)
-        if not np.issubdtype(chosen.dtype, np.integer):
-            raise ConfigError(f"a subset is chosen by at least one position, a whole number, not by {chosen.dtype}")
+        if not chosen.size:
+            raise ConfigError("a subset is chosen by at least one position, a whole number; none is given")
+        if chosen.ndim != 1 or not np.issubdtype(chosen.dtype, np.integer):
+            what = f"a list of positions, whole numbers{' (not by a mask)' if chosen.dtype == np.bool_ else ''}"
+            raise ConfigError(f"a subset is chosen by {what}, not by {_cut(repr(indices), 120)}")
         if absent := [index for index in chosen.tolist() if not -len(self) <= index < len(self)]:
             raise ConfigError(
                 f"a subset is chosen by positions, here 0 to {len(self) - 1} (not by ids), not by {absent[0]}"

@@ -430,6 +430,8 @@ def test_instance_set_refused(ids: list[int], contexts: list[list[float]], said:
         ([[1.0], [1.0, 2.0]], ("a",), {}, "the contexts must be numbers, as many in each row"),
         ([[1.0]], (3,), {}, "names of features are a tuple of words"),
         ([[1.0]], "a", {}, "names of features are a tuple of words"),
+        ([[1.0]], None, {}, "names of features are a tuple of words, not None"),
+        ([[1.0]], ("a",), None, "columns are numbers by name, a word, not None"),
         ([[1.0]], ("a",), {"level": ["high"]}, "the column 'level' must be numbers"),
     ],
 )
@@ -474,13 +476,16 @@ def test_subset() -> None:
     assert chosen.contexts.tolist() == [[10], [50]]
     for positions, said in (
         ([0, 0], "the id 1"),
-        ([], "at least one"),
-        ([True, False, True], "bool"),
+        ([], "at least one position, a whole number; none is given"),
+        ([True, False, True], r"\(not by a mask\), not by \[True, False, True\]"),
+        (3, "a list of positions, whole numbers, not by 3"),
+        ([[0]], r"a list of positions, whole numbers, not by \[\[0\]\]"),
+        (None, "not by None"),
         ([3], r"0 to 2 \(not by ids\), not by 3"),
         ([0, -4], "not by -4"),
     ):
         with pytest.raises(ConfigError, match=said):
-            instances.subset(positions)
+            instances.subset(positions)  # type: ignore[arg-type]
 
 
 def test_summary() -> None:
