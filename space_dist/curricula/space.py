@@ -36,7 +36,8 @@ class Space(Curriculum):
     kappa: how many instances a growth adds (paper: kappa).
     rank: what line 12 ranks by (paper: d_t(i)).
     mean: which reading of lines 6-7 decides: `same_set`, `as_printed` or `mean_abs_change` (docs/algorithm.md).
-    growth: `add`; `multiply` multiplies the size by kappa; `schedule` adds kappa without asking the values.
+    growth: `add`; `multiply` multiplies the size by kappa; `schedule` adds kappa without asking the values (in a
+        config of `kind: cspace` and `manual` alone, whose ranks need no values).
     adaptive_eta, patience, epsilon: Theorem 2 (`off`, `once`, `persistent`): behind `patience` tests in a row without
         growth, the next one is made with an eta that lets the set grow; `persistent` never lowers it again.
     """
