@@ -35,6 +35,7 @@ _LINK: Final = re.compile(r"(\]\()([^)\s#]*)((?:#[^)\s]*)?\))")
 _FENCE: Final = re.compile(r"^\s*(```|~~~)")
 _ITEM: Final = re.compile(r"^(\s*)(?:[-*+]|\d+\.)\s+\S")
 _CODE: Final = re.compile(r"`[^`\n]*`")
+_NAME: Final = re.compile(r'(<span class="doc doc-object-name[^>]*>)([\w.]+)(?=</span>)')
 
 
 def uri_of(path: str) -> str:
@@ -196,3 +197,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     if uri.endswith("/index.md"):
         return _LINK.sub(lambda found: _rewritten(found, uri.removeprefix(SOURCE), uri), markdown)
     return as_site(markdown, origin, uri) if origin.endswith(".md") else markdown
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:  # noqa: ARG001
+    """Let a narrow screen break the names that are headings of the API behind a dot or an underscore."""
+    return _NAME.sub(lambda found: found[1] + re.sub(r"(?<=[._])(?=\w)", "<wbr>", found[2]), output)

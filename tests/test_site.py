@@ -146,6 +146,24 @@ def test_arguments_and_fields_are_lists_on_the_page_of_the_api(site: Path) -> No
     assert "<p>Raises LedgerError where there is no policy yet," in text
 
 
+def test_a_narrow_screen_cuts_no_signature_off_and_breaks_no_word_of_a_heading(site: Path) -> None:
+    page = (site / "api.html").read_text()
+    assert "space_<wbr>dist.<wbr>api.<wbr>headroom.<wbr>measure_<wbr>headroom</span>" in page
+    assert 'href="signatures.css"' in page
+    assert "white-space: pre-wrap" in (site / "signatures.css").read_text()
+    assert "<wbr>" not in (site / "search/search_index.json").read_text()
+
+
+def test_the_page_of_the_api_explains_what_its_signatures_name(site: Path) -> None:
+    page = (site / "api.html").read_text()
+    rows = {
+        row for line in re.findall(r"<tr>\s*<td>(.*?)</td>", page) for row in re.findall(r"<code>(\w+)</code>", line)
+    }
+    assert rows >= {"Config", "Overrides", "Observations", "Row", "Run", "Ledger", "Cause", "EnvironmentSpec"}
+    for path in ("report.headroom.Headroom", "curricula.watching.WatchedState"):
+        assert f'id="space_dist.{path}"' in page
+
+
 def test_a_list_has_what_is_told_of_names_and_nothing_else() -> None:
     told = (
         "First: a line.\n\nBefore them. seed: of draws; None: none.  out,\nroot: where seed: is.  size: two\n"

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 class GridRun:
     """A grid's folder, read from Python: `GridRun("runs/quickstart")`, or what `run_grid` returns.
 
+    `manifest` is the grid as it was frozen, when this was made: `name`, `seeds`, `cells` (each with `label`, `settings`
+    and `config`), and of a search `search`, whose `trials` have `arm`, `parameters`, `state`, and the `value` reached.
     Raises LedgerError where there is no grid.
     """
 
@@ -84,8 +86,9 @@ def run_grid(
 
     grid: its YAML file, `shipped:NAME`, its folder, or its manifest.json.  root: the folder that holds grids' folders;
     None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  scale: the
-    share of a YAML file's seeds and steps, in a folder of its own (`<name>-scale-<scale>`).  overrides: key -> value,
-    or `KEY=VALUE`, as of `train`, for every cell of a YAML file, in a folder of its own (`<name>-set-<digest>`).
+    share of a YAML file's seeds and steps: 1.0, all of them, or less, in a folder of its own (`<name>-scale-<scale>`).
+    overrides: key -> value, or `KEY=VALUE`, as of `train`, for every cell of a YAML file, in a folder of its own
+    (`<name>-set-<digest>`).
     progress: show a line that changes in its place; or what is called now and then.
 
     Runs that fail are noted (`GridRun.statuses`) and raise nothing. Raises ConfigError for every fault of the files,

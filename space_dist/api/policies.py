@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 class ActingPolicy:
     """One policy of a run.
 
-    policy: its networks.  spec: of its environment: spaces, horizon, and the bounds of contexts.
+    policy: its networks.  spec: what its environment is like: `observation_space`, `action_space`, `horizon`,
+    `context_bounds`, ...
     """
 
     def __init__(self, policy: Policy, spec: EnvironmentSpec, *, seed: int = 0) -> None:

@@ -33,7 +33,8 @@ _SOURCE: Final = "config"  # what a config is called in sentences that lies in n
 class Run:
     """A run's folder, read from Python: `Run("runs/pointmass_space/s0")`, or what `train` returns.
 
-    tracking_warning: what MLflow's mirror lacks, as `train` found it. Raises LedgerError where there is no run.
+    tracking_warning: what MLflow's mirror lacks, as `train` found it. `ledger` has the paths of its files.
+    Raises LedgerError where there is no run.
     """
 
     def __init__(self, folder: Path | str, *, tracking_warning: str | None = None) -> None:
@@ -72,7 +73,7 @@ class Run:
         """The rows of `metrics.jsonl` (an iteration or an evaluation each), or of another file of rows.
 
         file: `metrics.jsonl`, `timing.jsonl`, `curriculum.jsonl` (a decision each) or `values.jsonl` (what instances
-        were worth at each). Raises ConfigError for any other, and LedgerError for rows that are damaged.
+        were worth at each). A row is a dict, by column. Raises ConfigError for any other, and LedgerError for rows that are damaged.
         """
         if file not in ROW_FILES:
             hint = nearest(str(file), ROW_FILES).removesuffix(".")

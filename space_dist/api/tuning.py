@@ -38,7 +38,8 @@ def run_search(
     here.  max_parallel: runs at a time; None: as many as there are CPUs for.  progress: show a line that changes in its
     place; or what is called now and then.
 
-    `GridRun.manifest.search` of what is returned has every trial and what it reached. Trials that fail are recorded as
+    `manifest.search.trials` of what is returned has every trial: `arm`, `parameters`, `state`, and the `value` that it
+    reached (None unless it is complete). Trials that fail are recorded as
     failed. Raises ConfigError for every fault of the files, LedgerError if the folder cannot be written, SpaceDistError
     if runs failed for reasons that say nothing of their settings.
     """

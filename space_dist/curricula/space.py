@@ -34,7 +34,8 @@ class Space(Curriculum):
     first: (n,) scores of which the highest decides the first instance instead; None: the seed.
     eta: growth threshold: the relative change of the mean start value below which the set grows (paper: eta).
     kappa: how many instances a growth adds (paper: kappa).
-    rank: what line 12 ranks by (paper: d_t(i)).
+    rank: what line 12 ranks by (paper: d_t(i)): a function of the feedback and of which instances were trained on that
+        gives (n,) scores, highest first. By default the change of the start value, as `pic: improvement`.
     mean: which reading of lines 6-7 decides: `same_set`, `as_printed` or `mean_abs_change` (docs/algorithm.md).
     growth: `add`; `multiply` multiplies the size by kappa; `schedule` adds kappa without asking the values (in a
         config of `kind: cspace` and `manual` alone, whose ranks need no values).

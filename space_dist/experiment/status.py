@@ -154,8 +154,9 @@ Condition = Literal["done", "running", "waiting", "failed"]
 class RunStatus:
     """Where one run stands.
 
+    run: which, as the grid names it: `title`, `seed`, `cell`.  ledger: its folder (`ledger.folder`), which `Run` reads.
     condition: `waiting` runs will be started, or go on, when somebody works on the grid; `failed` ones will not.
-    cause, detail: of the last attempt's end, if it has not been done since.
+    cause, detail: of the last attempt's end, if it has not been done since: a text as `out_of_memory`, and a sentence.
     steps, budget_steps: environment steps, and those that it is to take for now. attempts: how many began.
     other_code: done, but by another version of this package than the one here. end_recorded, supervised: of a run that
     is done, whether the end of its last attempt is written, and whether its supervisor lives that would write it.

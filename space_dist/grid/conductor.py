@@ -136,6 +136,8 @@ class Overview:
 
     steps_left, episodes_left: of the budgets of all runs that are neither done nor given up; the latter None where not
     all of the grid's runs end by episodes, and by_episodes says whether some do.
+    total, done, failed, waiting: numbers of runs.  running: those under way, as the grid names them: `title`, `seed`,
+    `cell`.  message: the last news.
     """
 
     total: int

@@ -32,7 +32,8 @@ _READINGS = 3  # of a file and the status that names it, which a live writer may
 class Status:
     """`status.json`. Steps are real environment steps of training; times are seconds since the epoch.
 
-    paused_at: of a run that is paused, the steps at which it was asked to be; 0 for any other.
+    paused_at: of a run that is paused, the steps at which it was asked to be; 0 for any other.  format: of its files; 2
+    is what this version writes.
     """
 
     state: State
