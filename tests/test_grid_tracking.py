@@ -441,8 +441,18 @@ def test_grids_and_runs_are_found_and_told_apart(tmp_path: Path) -> None:
         assert [one.folder for one in find([inside]).grids] == [grid.folder]
         assert find([inside]).ledgers == ()
     (tmp_path / "nothing").mkdir()
-    with pytest.raises(LedgerError, match="no run found in"):
+    with pytest.raises(LedgerError, match="no run or grid found in"):
         find([tmp_path / "nothing"])
+
+
+def test_what_mlflow_keeps_of_a_grid_is_not_taken_for_one(tmp_path: Path) -> None:
+    grid, _ = make_grid(tmp_path / "runs/demo", None)
+    start_run(ledger_of(grid, 0, 0).folder)
+    sync([], f"sqlite:///{tmp_path / 'mlflow/mlflow.db'}", grids=[grid])
+    assert list((tmp_path / "mlflow").rglob("manifest.json"))
+    with pytest.raises(LedgerError, match=r"no run or grid found in .*: no folder there has a status\.json, or a"):
+        find([tmp_path / "mlflow"])
+    assert [one.folder for one in find([tmp_path]).grids] == [grid.folder]
 
 
 def test_the_command_takes_a_grid_by_each_of_its_names(uri: str, tmp_path: Path) -> None:

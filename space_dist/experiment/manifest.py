@@ -252,6 +252,10 @@ class Grid:
     def __repr__(self) -> str:
         return f"Grid({str(self.folder)!r})"
 
+    def is_own(self) -> bool:
+        """Whether this is a grid's folder: one that has but a copy of a manifest, like MLflow's, has no instances."""
+        return self.manifest_file.is_file() and self.instances.is_dir()
+
     def manifest(self) -> Manifest:
         """The frozen grid. Raises LedgerError if there is none, or it is damaged."""
         try:

@@ -98,16 +98,19 @@ def find(paths: Iterable[Path]) -> Found:
             continue
         hit = False
         for folder, below, files in os.walk(path):
-            if MANIFEST in files or _STATUS in files:
+            is_grid = MANIFEST in files and Grid(folder).is_own()  # MLflow has copies of manifests, in its own folders
+            if is_grid or _STATUS in files:
                 below.clear()  # neither holds another one
                 hit = True
                 where = Path(folder).resolve()
-                if MANIFEST in files:
+                if is_grid:
                     grids[where] = Grid(folder)
                 else:
                     ledgers[where] = Ledger(folder)
         if not hit and len(ledgers) + len(grids) == before:
-            raise LedgerError(f"no run found in {path}: no folder there has a {_STATUS} or {MANIFEST}")
+            raise LedgerError(
+                f"no run or grid found in {path}: no folder there has a {_STATUS}, or a {MANIFEST} beside instances"
+            )
     return Found(tuple(ledgers[key] for key in sorted(ledgers)), tuple(grids[key] for key in sorted(grids)))
 
 
