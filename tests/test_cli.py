@@ -499,6 +499,7 @@ def test_a_dead_tracking_server_costs_a_warning_and_nothing_else(finished: Path,
     code, said = ended(prepared.command(command, tmp_path / "said"), tmp_path / "said")
     assert code == 0
     assert "warning: MLflow at http://127.0.0.1:9 could not be brought up to date" in said
+    assert "replays the run, and with `--uri URI` elsewhere" in said
     assert same(folder, finished)
 
 

@@ -459,7 +459,9 @@ def test_following_a_run_ends_when_nobody_works_any_more(
     looks[0] = 6
     assert command(monkeypatch, *follow) == 0
     assert looks[0] == 7  # somebody had begun it
-    assert capsys.readouterr().err.count("nobody works on the grid any more") == 2
+    said = capsys.readouterr().err
+    assert said.count("nobody works on the grid any more") == 2
+    assert f"going on with it: `space-dist grid run {grid.folder}`" in said
 
 
 def test_the_log_of_a_run_that_ends_by_episodes_ends_with_these(

@@ -23,7 +23,9 @@ import psutil
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
+from typer.testing import CliRunner
 
+from space_dist.cli import app
 from space_dist.config import TrackingConfig
 from space_dist.errors import ConfigError
 from space_dist.ledger import METRICS, TIMING, Ledger, RunWriter
@@ -269,6 +271,18 @@ def test_a_dead_server_costs_nothing(tmp_path: Path) -> None:
     ):
         sync([ledger], "http://127.0.0.1:9", "tests")
     assert contents(tmp_path) == before
+
+
+def test_a_dead_server_keeps_no_other_store_waiting(uri: str, tmp_path: Path) -> None:
+    for name, of in (("a", "http://127.0.0.1:9"), ("b", "http://127.0.0.1:9"), ("c", uri)):
+        start_run(tmp_path / name, uri=of)
+    done = CliRunner().invoke(app, ["sync", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "1 run is up to date in MLflow (1 new" in done.output
+    [line] = [line for line in done.output.splitlines() if "not mirrored" in line]
+    assert f"{tmp_path / 'a'}, {tmp_path / 'b'} are not mirrored: MLflow at http://127.0.0.1:9 cannot be" in line
+    assert line.endswith("once it works again; with --uri URI, elsewhere")
+    assert only_run(uri).info.run_name
 
 
 def answered(write: Callable[[socket.socket], None]) -> Iterator[str]:

@@ -312,6 +312,8 @@ def grid_logs(
     warn(f"{run.title}: {run_status.in_words}, {taken}. {ledger.folder}")
     if run_status.detail and run_status.condition != "done":
         warn(run_status.detail)
+    if run_status.condition == "waiting" and run_status.attempts and not place.owner_alive():
+        warn(f"going on with it: {_how_again(grid, place, manifest)}")  # the log is of `train`, and says --resume
 
 
 @grid_app.command("stop")

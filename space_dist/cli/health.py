@@ -211,7 +211,9 @@ def _store_of_environment(*, ask: bool) -> Iterator[Finding]:
         why = _failure(_ASK_MLFLOW, "server")
         yield Finding("ok", f"{URI_VARIABLE}: an MLflow answers at {parts.netloc}") if why is None else Finding(
             "broken", f"{URI_VARIABLE}: no MLflow answers at {parts.netloc}: {_cause(why)}",
-            f"start the server, or unset {URI_VARIABLE}; nothing of a run is lost meanwhile (space-dist sync)",
+            f"start the server, or unset {URI_VARIABLE} before a run begins: it keeps the URI it was begun with; "
+            "nothing of a run is lost meanwhile: `space-dist sync RUN` mirrors it later, `space-dist sync RUN --uri "
+            "URI` elsewhere",
         )  # fmt: skip
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _REPORT_WIDTH = 200  # characters
 _GRID_WIDTH = 150
 _MAX_CELLS_SHOWN = 60
+_MAX_NAMED = 5  # folders in a line
 _LINE_SECONDS = 10.0  # between lines of progress
 
 
@@ -351,10 +352,18 @@ def sync(
         highlight=False,
     )
     _name_pages(result.pages)
-    for folder, reason in result.failed.items():
-        warn(f"space-dist: {folder} is not mirrored: {reason}")
+    _name_failures(result.failed)
     if result.failed:
         raise typer.Exit(1)
+
+
+def _name_failures(failed: Mapping[Path, str]) -> None:
+    """Which runs and grids could not be mirrored: those of one reason, such as a dead server, in one line."""
+    for reason in dict.fromkeys(failed.values()):
+        folders = [str(folder) for folder, why in failed.items() if why == reason]
+        more = f" and {len(folders) - _MAX_NAMED} more" if len(folders) > _MAX_NAMED else ""
+        are = "is" if len(folders) == 1 else "are"
+        warn(f"space-dist: {', '.join(folders[:_MAX_NAMED])}{more} {are} not mirrored: {reason}")
 
 
 def _name_pages(pages: Iterable[str]) -> None:

@@ -254,7 +254,7 @@ class Grid:
 
     def is_own(self) -> bool:
         """Whether this is a grid's folder: one that has but a copy of a manifest, like MLflow's, has no instances."""
-        return self.manifest_file.is_file() and self.instances.is_dir()
+        return self.manifest_file.exists() and self.instances.is_dir()
 
     def manifest(self) -> Manifest:
         """The frozen grid. Raises LedgerError if there is none, or it is damaged."""

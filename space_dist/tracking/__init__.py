@@ -15,7 +15,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from pathlib import Path
@@ -57,8 +57,8 @@ class SyncResult:
 
     `runs` were brought up to date, `created` of them newly; `rows` of metrics.jsonl were pushed; `skipped` runs are to
     be shown nowhere. A grid's runs that have not begun do not count. `failed` names, by folder, the runs that could not
-    be mirrored because their ledger is damaged or MLflow refused their content: whoever calls must show them. `pages`
-    say where to look at what is in MLflow.
+    be mirrored because their ledger is damaged, MLflow refused their content, or their store could not be reached (and
+    others could): whoever calls must show them. `pages` say where to look at what is in MLflow.
     """
 
     runs: int = 0
@@ -131,7 +131,7 @@ def sync(
     `uri` and `experiment` default to each run's own (`tracking.uri`, `tracking.experiment` of its config), or to its
     grid's. A run that was deleted in MLflow is replayed afresh. `tell` hears of each run and grid that is begun with.
 
-    Raises ConfigError for a URI or experiment that cannot be used, TrackingError if a store cannot be reached.
+    Raises ConfigError for a URI or experiment that cannot be used, TrackingError if no store can be reached.
     """
     return _Mirror(uri, experiment, tell).push(Found(tuple(ledgers), tuple(grids)))
 
@@ -218,6 +218,8 @@ class _Mirror:
         self._open_sinks: dict[str, Sink] = {}
         self._settled: dict[Path, tuple[Status, bool]] = {}
         self._grids: dict[Path, GridMirror] = {}
+        self._dead: dict[str, str] = {}  # stores that could not be reached in this push, and why
+        self._reached = False  # whether another one could
         self.saw_life = False
         self.looking_seconds = 0.0
 
@@ -228,18 +230,37 @@ class _Mirror:
         )
 
     def push(self, found: Found) -> SyncResult:
+        """Bring all of it up to date. Raises TrackingError if no store can be reached."""
         self.saw_life, self.looking_seconds = False, 0.0
+        self._dead, self._reached = {}, False
         total = self._push_runs(found.ledgers)
         for grid in found.grids:
-            total = total.plus(self._push_grid(grid))
+            try:
+                total = total.plus(self._push_grid(grid))
+            except TrackingError as error:
+                total = total.plus(SyncResult(failed={grid.folder: str(error)}))
+        if self._dead and not self._reached:
+            raise TrackingError("\n".join(self._dead.values()))
         return total
+
+    @contextlib.contextmanager
+    def _reaching(self, uri: str) -> Iterator[None]:
+        """Ask a store. One that cannot be reached costs seconds, and is not asked again in this push."""
+        if uri in self._dead:
+            raise TrackingError(self._dead[uri])
+        try:
+            yield
+        except TrackingError as error:
+            self._dead[uri] = str(error)
+            raise
+        self._reached = True
 
     def _push_runs(self, ledgers: Sequence[Ledger]) -> SyncResult:
         total = SyncResult()
         for ledger in ledgers:
             try:
                 total = total.plus(self._push_run(ledger))
-            except (LedgerError, RefusedError, OSError) as error:
+            except (LedgerError, RefusedError, TrackingError, OSError) as error:
                 total = total.plus(SyncResult(failed={ledger.folder: str(error)}))
         return total
 
@@ -258,11 +279,13 @@ class _Mirror:
         result = SyncResult(1)
         if target is not None:
             self._tell(f"{ledger.folder}: to MLflow at {target[0]}")
-            store, experiment = self._store(target[0]), target[1]
-            # One writer at a time: SQLite gives up on a second one after its busy timeout.
-            with store.exclusively():
-                _, new, pushed = store.push(snapshot, experiment)
-            result = SyncResult(1, int(new), pushed, pages=(store.page(experiment),))
+            uri, experiment = target
+            with self._reaching(uri):
+                store = self._store(uri)
+                # One writer at a time: SQLite gives up on a second one after its busy timeout.
+                with store.exclusively():
+                    _, new, pushed = store.push(snapshot, experiment)
+                result = SyncResult(1, int(new), pushed, pages=(store.page(experiment),))
         # Noted last: what fails on the way is pushed again at the next look.
         self._settled[ledger.folder] = (status, alive)
         return result
@@ -282,15 +305,16 @@ class _Mirror:
         if uri is None:
             n_mirrored = mirror.begun - len(mirror.failed)
             return SyncResult(n_mirrored, failed=mirror.failed) if sinks else SyncResult(skipped=mirror.begun)
-        store, experiment = self._store(usable_uri(uri)), self._experiment or manifest.experiment
-        created = rows = 0
-        if mirror.changed:
-            self._tell(f"{grid.folder}: to MLflow at {usable_uri(uri)}")
-            try:
-                created, rows = mirror.push(manifest, store, experiment, self._tell)
-            except RefusedError as error:
-                return SyncResult(failed={grid.folder: str(error)})
-        pages = (store.page(experiment),)
+        experiment, created, rows = self._experiment or manifest.experiment, 0, 0
+        with self._reaching(usable_uri(uri)):
+            store = self._store(usable_uri(uri))
+            if mirror.changed:
+                self._tell(f"{grid.folder}: to MLflow at {usable_uri(uri)}")
+                try:
+                    created, rows = mirror.push(manifest, store, experiment, self._tell)
+                except RefusedError as error:
+                    return SyncResult(failed={grid.folder: str(error)})
+            pages = (store.page(experiment),)
         return SyncResult(mirror.begun - len(mirror.failed), created, rows, 0, mirror.failed, pages)
 
     def _grid(self, grid: Grid) -> GridMirror:

@@ -49,7 +49,8 @@ class Pusher:
         could = f"not all of {self._where} could" if " and " in self._where else f"{self._where} could not"
         return (
             f"{could} be brought up to date{why}; nothing is lost: `space-dist sync {self._folder}` "
-            f"replays the {what} (details: {self._log_file})"
+            f"replays the {what}, and with `--uri URI` elsewhere than into the store that it was begun with "
+            f"(details: {self._log_file})"
         )
 
     def pages(self) -> list[str]:

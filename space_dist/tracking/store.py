@@ -458,7 +458,7 @@ def store_errors(uri: str) -> Iterator[None]:
 def _unreachable(uri: str, error: Exception) -> TrackingError:
     return TrackingError(
         f"MLflow at {uri} cannot be written to: {_of_network(error) or _first_line(error)}. Nothing is lost: the "
-        "ledgers are complete, and `space-dist sync` replays them once it works again"
+        "ledgers are complete, and `space-dist sync` replays them once it works again; with --uri URI, elsewhere"
     )
 
 
