@@ -473,6 +473,27 @@ def test_the_log_of_a_run_that_ends_by_episodes_ends_with_these(
     assert f"waiting, 0 of {SMALL['budget.steps']:,} steps, 0 of 40 episodes. " in capsys.readouterr().err
 
 
+def test_episodes_that_end_runs_are_planned_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_grid(tmp_path, set=dict(SMALL) | {"budget.episodes": 40}, seeds=[0])
+    assert command(monkeypatch, "grid", "plan", path, "--root", tmp_path / "runs") == 0
+    said = capsys.readouterr().out
+    assert "environment steps in whole updates, or 40 episodes a run; " in said
+    assert said.count("at most 40 episodes a run") == len(plan(path, tmp_path / "runs").manifest.cells)
+
+
+def test_a_folder_of_grids_that_is_named_as_one_is_told_which_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("one", "two"):
+        plan(write_grid(tmp_path, name=name), tmp_path / "runs")
+    assert command(monkeypatch, "grid", "status", tmp_path / "runs") == 2
+    named = f"{tmp_path / 'runs/one'}, {tmp_path / 'runs/two'}"
+    said = capsys.readouterr().err
+    assert f"it has no manifest.json; 2 folders below it do, of which one is to be named: {named}" in said
+
+
 def test_a_pipe_in_a_grids_folder_keeps_nobody_waiting(tmp_path: Path) -> None:
     made = plan(write_grid(tmp_path), tmp_path / "runs")
     grid, ledger = made.grid, made.grid.ledger(made.manifest.runs()[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from space_dist.cli import main
 from space_dist.cli.runs import print_grid_report
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause, Ended
@@ -304,6 +306,25 @@ def test_where_runs_end_by_episodes_a_threshold_is_untestable(tmp_path: Path) ->
     by_episodes = dataclasses.replace(cell, cell=dataclasses.replace(cell.cell, config=config))
     [found] = compare([by_episodes], by_episodes)
     assert (found.reach, found.untestable) == (None, "untestable: runs end by episodes (at 2,000 to 3,000 steps)")
+    alike = dataclasses.replace(by_episodes.configuration, runs=by_episodes.configuration.runs[:1])
+    one = dataclasses.replace(by_episodes, configuration=alike)
+    assert compare([one], one)[0].untestable == "untestable: runs end by episodes (at 2,000 steps)"
+
+
+def test_a_report_on_a_folder_of_grids_says_what_it_leaves_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        finish(make_grid(tmp_path / "runs" / name, [{"k": 1}]), 0, 0 if name == "a" else 1, 3.0)
+    finish(Grid(tmp_path / "runs/b"), 0, 2, 2.0)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["space-dist", "report", str(tmp_path / "runs"), "--out", "there"])
+    with contextlib.suppress(SystemExit):
+        main()
+    said = capsys.readouterr().out
+    assert "2 runs of the grid a have not begun, and have no part in this." in " ".join(said.split())
+    assert "1 run of the grid b has not begun, and has no part in this." in " ".join(said.split())
+    assert said.endswith(f"Figure and tables: {tmp_path / 'there'}\n")
 
 
 # ---- odd grids ------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import html
 import io
@@ -13,9 +14,9 @@ from pathlib import Path
 from space_dist.api.arguments import as_path
 from space_dist.config import located
 from space_dist.config.quoting import short
-from space_dist.errors import ConfigError
-from space_dist.experiment.manifest import MANIFEST, find_grid
-from space_dist.ledger import find_ledgers
+from space_dist.errors import ConfigError, LedgerError, counted
+from space_dist.experiment.manifest import MANIFEST, find_grid, grids_below
+from space_dist.ledger import Ledger, find_ledgers
 from space_dist.report import build_grid_report, build_report
 from space_dist.system.workplace import workplace
 
@@ -83,7 +84,8 @@ def report_on(
     if not grids:
         if baseline is not None or threshold is not None:
             raise ConfigError(f"baseline and threshold are for grids; {', '.join(map(str, given))} is none")
-        found = build_report(find_ledgers(given), Path("report") if folder is None else folder)
+        ledgers = find_ledgers(given)
+        found = build_report(ledgers, Path("report") if folder is None else folder, not_begun=not_begun(given, ledgers))
         place = found.figure.parent
         return ReportView(
             place,
@@ -115,6 +117,19 @@ def _listed(paths: object) -> Sequence[Path | str]:
 def is_grid(path: Path) -> bool:
     """Whether a path names a grid: a folder with a manifest, or a file."""
     return (path / MANIFEST).is_file() or (not path.is_dir() and (path.name == MANIFEST or path.suffix in _YAML))
+
+
+def not_begun(paths: Sequence[Path], ledgers: Sequence[Ledger]) -> list[str]:
+    """How many runs of the grids below these folders a report of their ledgers leaves out, a sentence a grid."""
+    begun, sentences = {ledger.folder.resolve() for ledger in ledgers}, []
+    for grid in {grid.folder.resolve(): grid for path in paths for grid in grids_below(path)}.values():
+        with contextlib.suppress(LedgerError):  # of a damaged manifest, `grid status` tells
+            runs = grid.manifest().runs()
+            left_out = sum(grid.ledger(run).folder.resolve() not in begun for run in runs)
+            have = "have" if left_out > 1 else "has"
+            of = f"{counted(left_out, 'run')} of the grid {grid.folder.name}"
+            sentences += [f"{of} {have} not begun, and {have} no part in this."] if left_out else []
+    return sentences
 
 
 def _pictures(markdown: str, folder: Path) -> dict[str, Path]:

@@ -73,7 +73,8 @@ class Run:
         """The rows of `metrics.jsonl` (an iteration or an evaluation each), or of another file of rows.
 
         file: `metrics.jsonl`, `timing.jsonl`, `curriculum.jsonl` (a decision each) or `values.jsonl` (what instances
-        were worth at each). A row is a dict, by column. Raises ConfigError for any other, and LedgerError for rows that are damaged.
+        were worth at each). A row is a dict, by column. Raises ConfigError for any other file, and LedgerError for rows
+        that are damaged.
         """
         if file not in ROW_FILES:
             hint = nearest(str(file), ROW_FILES).removesuffix(".")

@@ -18,6 +18,7 @@ from space_dist.cli.overview import (
     Watching,
     display,
     episodes_of,
+    or_episodes,
     print_cells,
     print_failures,
     status_json,
@@ -118,7 +119,7 @@ def grid_plan(
     print_cells(manifest, found)
     say(
         f"{counted(len(manifest.cells), 'cell')} x {counted(len(manifest.seeds), 'seed')} = "
-        f"{counted(len(found), 'run')}, {made.steps:,} environment steps in whole updates; "
+        f"{counted(len(found), 'run')}, {made.steps:,} environment steps in whole updates{or_episodes(manifest)}; "
         f"{counted(manifest.cpus_per_run, 'CPU')} a run"
         + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )

@@ -183,11 +183,23 @@ def _cell_row(cell: Cell, found: Sequence[RunStatus]) -> dict[str, str]:
     steps = sum(run_status.steps for run_status in found)
     # A run that is done has none left, though another update may not have fitted into its budget.
     of_all = sum(one.steps if one.condition == "done" else one.budget_steps for one in found)
+    episodes = "" if cell.episodes_to_take is None else f", at most {counted(cell.episodes_to_take, 'episode')} a run"
     return {
         "cell": cell.label, "id": cell.id, "done": f"{counts['done']}/{len(found)}",
         **{condition: str(counts[condition] or "") for condition in ("running", "waiting", "failed")},
-        "steps": f"{steps / max(1, of_all):.0%} of {of_all:,}",
+        "steps": f"{steps / max(1, of_all):.0%} of {of_all:,}{episodes}",
     }  # fmt: skip
+
+
+def or_episodes(manifest: Manifest) -> str:
+    """What else ends the runs of a grid than their steps."""
+    limits = {cell.episodes_to_take for cell in manifest.cells}
+    if limits == {None}:
+        return ""
+    [limit, *others] = limits
+    return (
+        ", or fewer, where episodes end runs" if others or limit is None else f", or {counted(limit, 'episode')} a run"
+    )
 
 
 def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:

@@ -227,7 +227,7 @@ def report(
     ] = None,
 ) -> None:
     """Compare runs, or the cells of a grid: figures and tables with 95 % intervals over seeds."""
-    from space_dist.api.reports import is_grid
+    from space_dist.api.reports import is_grid, not_begun
     from space_dist.config import located
     from space_dist.experiment.manifest import in_root
     from space_dist.ledger import find_ledgers
@@ -248,7 +248,9 @@ def report(
         raise ConfigError(f"{grids[0]} is a grid: give it alone, for each grid has a report of its own")
     if baseline is not None or threshold is not None or scale != 1.0 or changes:
         raise ConfigError(f"--baseline, --threshold, --scale and --set are for grids; {paths[0]} is none")
-    print_report(build_report(find_ledgers(paths), Path("report") if out is None else out), console)
+    ledgers = find_ledgers(paths)
+    folder = Path("report") if out is None else out
+    print_report(build_report(ledgers, folder, not_begun=not_begun(paths, ledgers)), console)
 
 
 def _grid(path: Path, root: Path | None, scale: float, changes: Sequence[str]) -> Grid:
@@ -278,7 +280,7 @@ def print_report(result: Report, to: Console) -> None:
             _print_blocks(result.table, to)
     for remark in result.remarks:
         to.print(remark, highlight=False, markup=False)
-    to.print(f"Figure and tables: {result.figure.parent}", highlight=False, markup=False, soft_wrap=True)
+    to.print(f"Figure and tables: {result.figure.parent.absolute()}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _print_blocks(rows: Sequence[Mapping[str, str]], to: Console) -> None:

@@ -7,7 +7,7 @@ import keyword
 import re
 import types
 from collections.abc import Iterator, Mapping, Sized
-from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
+from typing import Annotated, Any, Final, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -57,6 +57,9 @@ NOT_HERE = (
 _TAKES_KWARGS = {EnvConfig: "the environment", CustomConfig: "a curriculum of your own"}
 _CUSTOM = "custom"
 _OWN_CURRICULUM = f"a curriculum of your own, which import names, has `kind: {_CUSTOM}`"
+
+# Of keys that some take to be instead of another: what stands behind a sentence about their lack.
+_BESIDE: Final = {"budget.steps": "; budget.episodes, which may end a run before, stands beside it, and not instead"}
 
 
 def schema(of: type[BaseModel] = RunConfig) -> Iterator[tuple[str, str, str, str]]:
@@ -138,7 +141,7 @@ def explain(
         if root is not RunConfig and keyword.iskeyword(path[-1]):  # the key is an argument, and Python's own word
             way_out = f"; as an argument it is written **{{{path[-1]!r}: ...}}"
         needed = f": a section with {needs}" if (needs := _needs(options)) else ""
-        return f"{where}: {key}: this key is required{needed}{way_out}{_allowed_kinds(options)}"
+        return f"{where}: {key}: this key is required{_BESIDE.get(key, '')}{needed}{way_out}{_allowed_kinds(options)}"
     if kind in ("model_type", "model_attributes_type"):
         # An item of a list, or what a user's own name stands for, is no field: then the model is its own.
         named = [one for one in (*options, model) if one and one.__name__ == context.get("class_name")]
@@ -161,7 +164,7 @@ def explain(
             return f"{where}: {key}: {message}"
         return f"{where}: {key}: {message}, not {short(given)}"
     if given is None:
-        return f"{where}: {key}: is empty; give it {_what_to_give(field, value, fault)}"
+        return f"{where}: {key}: is empty; give it {_what_to_give(field, value, fault)}{_BESIDE.get(key, '')}"
     if kind == "literal_error" and isinstance(given, str) and not is_choice(value):
         words = re.findall(r"'([^']+)'", str(context.get("expected")))
         return f"{where}: {key}: {short(given)} is not known{nearest(given, words)} Allowed: {', '.join(words)}"

@@ -327,6 +327,11 @@ class Grid:
         return configs.parse(data, f"{self.manifest_file}, cell {run.cell.id}")
 
 
+def grids_below(folder: Path) -> list[Grid]:
+    """The grids in the folders of a folder, however deep, by path."""
+    return [grid for file in sorted(folder.rglob(MANIFEST)) if (grid := Grid(file.parent)).is_own()]
+
+
 def in_root(path: Path, root: Path) -> Path:
     """The folder of the grid that is called so below `root`; of anything else that a user may name, the path itself.
 
@@ -340,6 +345,15 @@ def in_root(path: Path, root: Path) -> Path:
         hint = f"; did you mean {meant!r}?" if meant else nearest(path.name, known)
         raise ConfigError(f"{path} is neither here nor a grid in {root}{hint}".removesuffix("."))
     return root / path
+
+
+def _below(folder: Path) -> str:
+    """Which grids to name instead of a folder that is none."""
+    found = [str(grid.folder) for grid in grids_below(folder)]
+    if len(found) < 2:
+        return "".join(f"; {one} does" for one in found)
+    more = f" and {len(found) - _MAX_NAMED:,} more" if len(found) > _MAX_NAMED else ""
+    return f"; {len(found):,} folders below it do, of which one is to be named: {', '.join(found[:_MAX_NAMED])}{more}"
 
 
 def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()) -> Grid:
@@ -361,7 +375,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
         )
     if path.is_dir():
         if not (path / MANIFEST).exists():
-            raise NotPlannedError(f"{path} holds no grid: it has no {MANIFEST}")
+            raise NotPlannedError(f"{path} holds no grid: it has no {MANIFEST}{_below(path)}")
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)

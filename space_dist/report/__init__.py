@@ -64,8 +64,10 @@ class Report:
     figure: Path
 
 
-def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
+def build_report(ledgers: Sequence[Ledger], out: Path, *, not_begun: Sequence[str] = ()) -> Report:
     """Compare runs: writes `report.png`, `report.md` and `report.csv` into `out`, which is created.
+
+    not_begun: sentences on runs that have no ledger yet.
 
     Raises ConfigError if there are no ledgers, if a configuration has the same seed twice, or if `out` cannot be
     written to; LedgerError if a ledger is damaged.
@@ -77,6 +79,7 @@ def build_report(ledgers: Sequence[Ledger], out: Path) -> Report:
     table = [cells(summary) for summary in summaries]
     few = few_seeds({summary.label: summary.test.n for summary in summaries})
     notes = [line for configuration in configurations for line in remarks(configuration)]
+    notes += not_begun
     picture = Picture("report.png", "Learning curves and set sizes", png(draw_comparison(configurations)))
     found = Section("", few, table, notes, [picture])
     document = Document("Report", [found, Section("How to read this", [_METHOD])])

@@ -258,7 +258,8 @@ def _untestable(cell: CellRuns, threshold: float) -> str:
         return "no finished seed"
     if cell.cell.config["budget"].get("episodes") is not None:  # for one that never comes there, no end is everybody's
         ends = [run.status.steps for run in cell.configuration.finished]
-        return f"untestable: runs end by episodes (at {min(ends):,} to {max(ends):,} steps)"
+        span = f"{min(ends):,}" if min(ends) == max(ends) else f"{min(ends):,} to {max(ends):,}"
+        return f"untestable: runs end by episodes (at {span} steps)"
     if len(starts) < 2:
         return "untestable: one seed shows no noise at step 0, more seeds do"
     bound = start_bound(starts)

@@ -88,7 +88,7 @@ not reach it within their budget are censored: they count as the budget in the r
 of the mean where seeds are censored. The ratio is the cell's restricted mean over the baseline's (0.5: in half of the
 steps), both up to the smaller budget; its interval is of pairs of seeds, and the threshold is held fixed. Untestable:
 the threshold lies within noise of step 0, that is not above the 97.5 % prediction bound (mean + t s sqrt(1 + 1/n)) of
-one more untrained seed.
+one more untrained seed; or runs end by episodes, and have no last step in common.
 
 Early is the area under the curve of the return on the held-out instances over environment steps (trapezoid), up to
 where the longest run of the same task ended, divided by that: the mean return over training. The worst tenth (CVaR) are
