@@ -435,6 +435,29 @@ def test_a_stopped_run_lacks_no_explanation(
     assert way == f"`space-dist grid retry {grid.folder} --cause killed` gives another try"
 
 
+def test_watching_from_a_pipe_prints_what_has_changed(
+    one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid, _, run = one
+    looks, lock = [0], Lock(grid.lock_file)
+
+    def look(seconds: float) -> None:  # noqa: ARG001 - the signature is `time.sleep`'s
+        looks[0] += 1
+        if looks[0] == 3:
+            lock.acquire()
+        elif looks[0] == 6:
+            Attempts(grid.ledger(run)).begin(1, {})
+        elif looks[0] == 8:
+            Attempts(grid.ledger(run)).end(1, Ended(Cause.STOPPED))
+            lock.release()
+        assert looks[0] < 20
+
+    monkeypatch.setattr("space_dist.cli.grids.time.sleep", look)
+    assert command(monkeypatch, "grid", "status", grid.folder, "--watch") == 3
+    assert looks[0] > 8
+    assert 3 <= capsys.readouterr().out.count("runs done") <= 5
+
+
 def test_following_a_run_ends_when_nobody_works_any_more(
     one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

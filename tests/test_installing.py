@@ -307,6 +307,7 @@ def test_what_hangs_and_what_crashes_is_told(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize(("uri", "state", "told"), [
     ("nonsense://x", "broken", "a tracking URI of the kind nonsense: cannot be mirrored to"),
+    ("rel.db", "broken", "the tracking URI 'rel.db' has no beginning that says what it is; did you mean sqlite:///rel.db?"),
     ("http://127.0.0.1:9", "broken", "no MLflow answers at 127.0.0.1:9: Connection refused"),
     ("http://127.0.0.1:{port}/", "broken", "no MLflow answers at 127.0.0.1:"),
     ("sqlite:///{there}/mlflow.db", "ok", "a database in {there}"),
@@ -323,7 +324,7 @@ def test_where_the_environment_mirrors_to_is_looked_at(
         no_mlflow.shutdown()
     assert found.state == state
     assert f"MLFLOW_TRACKING_URI: {told.format(**words)}" in found.what
-    assert len(found.what) <= 200 + len(str(tmp_path))
+    assert len(found.what) <= 300 + len(str(tmp_path))
     if "no MLflow answers" in told:  # a run keeps the URI that it was begun with, which no environment changes
         assert "`space-dist sync RUN --uri URI` elsewhere" in found.mend
 

@@ -56,7 +56,8 @@ def events(folder: Path) -> dict[str, list[tuple[int, int, float]]]:
 def test_tensorboard_has_what_the_ledger_has_once(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     ledger = showing(start_run(tmp_path / "run"), "tensorboard")
-    assert sync([ledger]).runs == 1
+    result, folder = sync([ledger]), ledger.folder / "tensorboard"
+    assert (result.runs, result.pages) == (1, (f"{folder}: `tensorboard --logdir {folder}`",))
     continue_run(ledger, TEST, GROWTH, until=2, state="interrupted")
     sync([ledger])
     assert [(step, value) for step, _, value in events(ledger.folder)["test/return"]] == [
@@ -107,6 +108,8 @@ def test_a_grid_in_tensorboard_has_a_curve_for_each_cell(tmp_path: Path) -> None
     grid, _ = make_grid(tmp_path / "demo", None, etas=(0.1,), tracking=GridTracking(uri=None, sinks=("tensorboard",)))
     run_to(grid, 0, 0, last=1.0)
     assert (sync([], grids=[grid]).runs, sync([], grids=[grid]).skipped) == (1, 0)
+    folder = grid.folder / "tensorboard"
+    assert sync([], grids=[grid]).pages == (f"{folder}: `tensorboard --logdir {folder}`",)
     run_to(grid, 0, 1, last=3.0)
     sync([], grids=[grid])
     place = grid.folder / "tensorboard/eta=0.1"
@@ -125,7 +128,8 @@ def test_weights_and_biases_has_a_run_once_it_rests(tmp_path: Path) -> None:
     (folder,) = (ledger.folder / "wandb").glob("offline-run-*")
     assert [path.suffix for path in folder.rglob("*") if path.is_file()] == [".wandb"]  # no log that is still written
     before = contents(ledger.folder)
-    sync([ledger])
+    place = ledger.folder / "wandb"
+    assert sync([ledger]).pages == (f"{place}: `wandb sync` uploads its folders offline-run-...",)
     assert contents(ledger.folder) == before
     rows = [row for row in history(next(folder.glob("*.wandb"))) if "test/return" in row]
     assert [(row["steps"], row["test/return"]) for row in rows] == [(1000 * n, TEST[n]) for n in range(5)]

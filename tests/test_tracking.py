@@ -377,6 +377,19 @@ def test_other_stores_are_refused(tmp_path: Path, store: str) -> None:
     assert "word@" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(
+    ("uri", "said"),
+    [("rel.db", "'rel.db' has no beginning that says what it is; did you mean sqlite:///rel.db? allowed"),
+     ("/srv/x.sqlite", "did you mean sqlite:////srv/x.sqlite? allowed"),
+     ("databricks", "'databricks' has no beginning that says what it is; allowed"),
+     ("mlruns", "'mlruns' is a folder of files"), ("/srv/runs", "'/srv/runs' is a folder of files")]
+)  # fmt: skip
+def test_a_tracking_uri_without_a_scheme_is_told_what_it_lacks(uri: str, said: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        store.usable_uri(uri)
+    assert said in str(refusal.value)
+
+
 @pytest.mark.parametrize("content", [b"this is no database" * 100, None])
 def test_a_file_that_is_no_database_is_said_so(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "mlflow.db"

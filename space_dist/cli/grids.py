@@ -259,18 +259,22 @@ def grid_status(
     place, manifest = _found(grid, root, scale, changes or ())
     if address is not None:
         raise typer.Exit(_remote_status(place, manifest, address))
-    watched, watching = WatchedQueue(place.folder), Watching()
+    watched, watching, shown = WatchedQueue(place.folder), Watching(), dict[str, Any]()
     while True:
         queue = watched.now()
         found = run_statuses_of(place, manifest)
-        if as_json:
-            print_json(status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()}))
+        now = status_json(manifest, place, found) | ({} if queue is None else {"slurm": queue.to_json()})
+        if now == shown and not console.is_terminal:  # a file or a pipe keeps what it was told
+            pass
+        elif as_json:
+            print_json(now)
         else:
             if watch and console.is_terminal:
                 console.clear()
             print_cells(manifest, found)
             print_failures(found, by_cause)
             say(summary(manifest, found) + workers_in_words(place, queue))
+        shown = now
         settled = all(run_status.condition in ("done", "failed") for run_status in found)
         if not watch or output_left() or settled or watching.is_over(place, queue, found):
             raise typer.Exit(exit_code(found))

@@ -371,8 +371,11 @@ def _name_failures(failed: Mapping[Path, str]) -> None:
 def _name_pages(pages: Iterable[str]) -> None:
     from space_dist.tracking.pusher import LOOK_AT
 
-    for page in pages:
+    shown = list(pages)
+    for page in shown[:_MAX_NAMED]:
         say(f"{LOOK_AT}{page}")
+    if len(shown) > _MAX_NAMED:
+        say(f"... and {len(shown) - _MAX_NAMED:,} more places like these")
 
 
 @contextlib.contextmanager

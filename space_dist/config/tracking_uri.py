@@ -22,6 +22,7 @@ DEFAULT: Final = "sqlite:///mlflow.db"
 URI_VARIABLE: Final = "MLFLOW_TRACKING_URI"
 EXPERIMENT_VARIABLE: Final = "MLFLOW_EXPERIMENT_NAME"
 _SQLITE: Final = "sqlite:///"
+_DATABASES: Final = (".db", ".sqlite", ".sqlite3")  # how a file's name ends that is meant as one
 _MAX_EXPERIMENT: Final = 200
 
 
@@ -92,6 +93,9 @@ def checked_uri(uri: str) -> str:
         if name in (uri, "", ":memory:") or name.endswith("/") or "?" in name or "\0" in name:
             raise UriError(f"the tracking URI{shown} names no database file; {ALLOWED}")
         return uri
+    if parts.scheme == "" and (uri.endswith(_DATABASES) or not ("/" in uri or uri == "mlruns")):  # no path of a folder
+        nearest = f"; did you mean {_SQLITE}{uri}?" if uri.endswith(_DATABASES) and shown else ";"
+        raise UriError(f"the tracking URI{shown} has no beginning that says what it is{nearest} {ALLOWED}")
     if parts.scheme in ("", "file"):
         raise UriError(f"the tracking URI{shown} is a folder of files, which MLflow no longer supports; {ALLOWED}")
     raise UriError(f"a tracking URI of the kind {parts.scheme}: cannot be mirrored to; {ALLOWED}")

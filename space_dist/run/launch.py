@@ -117,7 +117,7 @@ def launch(
                 part.training(cluster, observe).run()
     # The lock is free by now: a server that hangs keeps nobody from the run.
     if active.pusher is not None:
-        waiting(f"mirroring to MLflow, for {_FINAL_PUSH_SECONDS:.0f} s at most")
+        waiting(f"mirroring to {active.pusher.where}, for {_FINAL_PUSH_SECONDS:.0f} s at most")
     return active.finished()
 
 

@@ -58,7 +58,8 @@ class SyncResult:
     `runs` were brought up to date, `created` of them newly; `rows` of metrics.jsonl were pushed; `skipped` runs are to
     be shown nowhere. A grid's runs that have not begun do not count. `failed` names, by folder, the runs that could not
     be mirrored because their ledger is damaged, MLflow refused their content, or their store could not be reached (and
-    others could): whoever calls must show them. `pages` say where to look at what is in MLflow.
+    others could): whoever calls must show them. `pages` say where to look at what is in MLflow, and in
+    other sinks.
     """
 
     runs: int = 0
@@ -276,7 +277,7 @@ class _Mirror:
         snapshot = read_snapshot(ledger, status, alive, config)
         for sink in sinks:
             sink.push(snapshot)
-        result = SyncResult(1)
+        result = SyncResult(1, pages=_pages_of(sinks, ledger.folder))
         if target is not None:
             self._tell(f"{ledger.folder}: to MLflow at {target[0]}")
             uri, experiment = target
@@ -285,7 +286,7 @@ class _Mirror:
                 # One writer at a time: SQLite gives up on a second one after its busy timeout.
                 with store.exclusively():
                     _, new, pushed = store.push(snapshot, experiment)
-                result = SyncResult(1, int(new), pushed, pages=(store.page(experiment),))
+                result = SyncResult(1, int(new), pushed, pages=(store.page(experiment), *result.pages))
         # Noted last: what fails on the way is pushed again at the next look.
         self._settled[ledger.folder] = (status, alive)
         return result
@@ -301,10 +302,15 @@ class _Mirror:
         sinks = self._sinks(manifest.tracking.sinks)
         if sinks:
             mirror.feed(manifest, sinks)
+        places = _pages_of(sinks, grid.folder)
         uri = self._uri if self._uri is not None else settled_uri(manifest.tracking.uri)
         if uri is None:
             n_mirrored = mirror.begun - len(mirror.failed)
-            return SyncResult(n_mirrored, failed=mirror.failed) if sinks else SyncResult(skipped=mirror.begun)
+            return (
+                SyncResult(n_mirrored, failed=mirror.failed, pages=places)
+                if sinks
+                else SyncResult(skipped=mirror.begun)
+            )
         experiment, created, rows = self._experiment or manifest.experiment, 0, 0
         with self._reaching(usable_uri(uri)):
             store = self._store(usable_uri(uri))
@@ -314,7 +320,7 @@ class _Mirror:
                     created, rows = mirror.push(manifest, store, experiment, self._tell)
                 except RefusedError as error:
                     return SyncResult(failed={grid.folder: str(error)})
-            pages = (store.page(experiment),)
+            pages = (store.page(experiment), *places)
         return SyncResult(mirror.begun - len(mirror.failed), created, rows, 0, mirror.failed, pages)
 
     def _grid(self, grid: Grid) -> GridMirror:
@@ -341,6 +347,11 @@ class _Mirror:
             with store_errors(uri):
                 self._stores[uri] = Store(uri)
         return self._stores[uri]
+
+
+def _pages_of(sinks: Sequence[Sink], root: Path) -> tuple[str, ...]:
+    """Where to look at what sinks other than MLflow have of a folder."""
+    return tuple(page for sink in sinks if (page := sink.page(root)) is not None)
 
 
 def _tracking(config: Mapping[str, Any]) -> Mapping[str, Any]:

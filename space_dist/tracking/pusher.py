@@ -23,13 +23,13 @@ LOOK_AT: Final = "Look at "  # begins the lines in which `sync` names MLflow's p
 class Pusher:
     """One process that pushes all there is in a folder: a store has one writer, and a slow server costs no training.
 
-    tracking: where to, for messages.  folder: a run's or a grid's.  log_file: where it writes what it says.  Raises
-    OSError if that cannot be written or no process can be started.
+    tracking: where to, for messages (`where`).  folder: a run's or a grid's.  log_file: where it writes what it says.
+    Raises OSError if that cannot be written or no process can be started.
     """
 
     def __init__(self, tracking: Mirrors, folder: Path, log_file: Path) -> None:
         places = [f"MLflow at {tracking.uri}"] if tracking.uri is not None else []
-        self._where, self._folder, self._log_file = " and ".join([*places, *tracking.sinks]), folder, log_file
+        self.where, self._folder, self._log_file = " and ".join([*places, *tracking.sinks]), folder, log_file
         command = [*PYTHON, "-m", "space_dist.cli", "sync", "--follow", "--", str(folder)]
         with appending(log_file) as output:
             self._said_before = os.fstat(output.fileno()).st_size
@@ -46,7 +46,7 @@ class Pusher:
         why = f" in {seconds:.0f} s" if self._process.returncode < 0 else ""
         if self._process.returncode == _REFUSED and (said := self._said()):
             why = f": {said[-1].removeprefix(_BEGINNING)}"
-        could = f"not all of {self._where} could" if " and " in self._where else f"{self._where} could not"
+        could = f"not all of {self.where} could" if " and " in self.where else f"{self.where} could not"
         return (
             f"{could} be brought up to date{why}; nothing is lost: `space-dist sync {self._folder}` "
             f"replays the {what}, and with `--uri URI` elsewhere than into the store that it was begun with "
@@ -54,7 +54,7 @@ class Pusher:
         )
 
     def pages(self) -> list[str]:
-        """Where to look at what was pushed, in words; none before it has ended well, and none without MLflow."""
+        """Where to look at what was pushed, in words; none before it has ended well."""
         # Each once: the pusher of a conductor that was killed writes its own into the same file.
         return list(dict.fromkeys(line.removeprefix(LOOK_AT) for line in self._said() if line.startswith(LOOK_AT)))
 

@@ -32,6 +32,9 @@ class Sink(Protocol):
     def push(self, record: Record) -> None:
         """Bring it up to date. Raises OSError where it cannot be written."""
 
+    def page(self, root: Path) -> str | None:
+        """Where people look at what is there of a run's or a grid's folder, in words; None if nothing is."""
+
 
 @dataclass(frozen=True)
 class Synced:

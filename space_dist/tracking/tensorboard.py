@@ -7,6 +7,8 @@ It is written behind what is known to be whole, so that whatever a death left ha
 from __future__ import annotations
 
 import os
+import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from space_dist.system.files import open_own
@@ -27,6 +29,11 @@ class TensorBoard:
         """Add the rows that are not there. Raises OSError where the folder cannot be written."""
         with turn(record.root / FOLDER):
             self._push(record)
+
+    def page(self, root: Path) -> str | None:
+        """See `Sink`."""
+        folder = root / FOLDER
+        return f"{folder}: `{shlex.join(['tensorboard', '--logdir', str(folder)])}`" if folder.is_dir() else None
 
     def _push(self, record: Record) -> None:
         from tensorboard.compat.proto.event_pb2 import Event

@@ -35,6 +35,11 @@ class WeightsAndBiases:
         with turn(record.root / FOLDER):
             self._push(record)
 
+    def page(self, root: Path) -> str | None:
+        """See `Sink`."""
+        folder = root / FOLDER
+        return f"{folder}: `wandb sync` uploads its folders offline-run-..." if folder.is_dir() else None
+
     def _push(self, record: Record) -> None:
         folder = record.root / FOLDER / record.name
         points = [*record.points(0)]
