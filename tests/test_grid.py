@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import random
@@ -12,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from space_dist import config as configs
 from space_dist.api.grids import frozen
 from space_dist.cli.grids import grid_retry
-from space_dist.cli.overview import print_failures
+from space_dist.cli.overview import _live_table, print_failures
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.grid_file import GridConfig, label_of
@@ -28,14 +30,16 @@ from space_dist.experiment.status import (
     run_status_of,
     run_statuses,
 )
+from space_dist.grid.conductor import Overview
 from space_dist.grid.planning import plan
-from space_dist.ledger import Lock
+from space_dist.ledger import METRICS, Lock, RunWriter
 from space_dist.slurm.export import JOBS
 from space_dist.slurm.queue import queue_of
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import source_digest
 from tests.commanding import command
 from tests.grids import ROOT, SMALL, SPACE, TINY, write_grid, write_line_instances
+from tests.test_report import start_run
 
 CODE = "0" * 16
 
@@ -456,6 +460,20 @@ def test_watching_from_a_pipe_prints_what_has_changed(
     assert command(monkeypatch, "grid", "status", grid.folder, "--watch") == 3
     assert looks[0] > 8
     assert 3 <= capsys.readouterr().out.count("runs done") <= 5
+
+
+def test_a_row_of_the_display_is_as_far_as_its_evaluation(one: tuple[Grid, Manifest, Run]) -> None:
+    """An evaluation may come before the first iteration ends, with which its set is written."""
+    grid, manifest, run = one
+    ledger = start_run(grid.ledger(run).folder)
+    with RunWriter(ledger) as writer:
+        writer.status = ledger.status()
+        writer.append(METRICS, {"kind": "evaluation", "steps": 2048, "test": {"return": 4.16}})
+    overview = Overview(total=1, steps_left=4096, running=[run])
+    shown = Console(file=io.StringIO(), width=200)
+    shown.print(_live_table(manifest, grid, overview, ""))
+    told = " ".join(shown.file.getvalue().split())  # type: ignore[attr-defined]
+    assert f"2,048 of {run.cell.steps_to_take:,} steps set — test return 4.16" in told
 
 
 def test_following_a_run_ends_when_nobody_works_any_more(

@@ -20,11 +20,9 @@ from space_dist.cli.overview import (
     episodes_of,
     or_episodes,
     print_cells,
-    print_failures,
+    print_stand,
     status_json,
-    summary,
     tell,
-    workers_in_words,
 )
 from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one_of, output_left, say, warn
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError, counted
@@ -271,9 +269,7 @@ def grid_status(
         else:
             if watch and console.is_terminal:
                 console.clear()
-            print_cells(manifest, found)
-            print_failures(found, by_cause)
-            say(summary(manifest, found) + workers_in_words(place, queue))
+            print_stand(place, manifest, found, by_cause, queue)
         shown = now
         settled = all(run_status.condition in ("done", "failed") for run_status in found)
         if not watch or output_left() or settled or watching.is_over(place, queue, found):

@@ -133,11 +133,12 @@ def _live_table(manifest: Manifest, place: Grid, overview: Overview, time_left: 
     for run in overview.running[:_SHOWN_RUNS]:
         ledger, line = place.ledger(run), "starting"
         with contextlib.suppress(SpaceDistError, KeyError, IndexError):
-            rows = ledger.rows(CURRICULUM)
-            evaluations = [row for row in ledger.rows() if row["kind"] == "evaluation"]
+            sets, rows = ledger.rows(CURRICULUM), ledger.rows()
+            evaluations = [row for row in rows if row["kind"] == "evaluation"]
             shown = f"{evaluations[-1]['test']['return']:.3g}" if evaluations else "—"
-            steps = rows[-1]["steps"] if rows else 0
-            size = len(rows[-1]["trained"]) if rows else 0
+            # A set is written when its iteration ends: behind an evaluation that came with its first update, say.
+            steps = max((row["steps"] for row in (*rows[-1:], *sets[-1:])), default=0)
+            size = len(sets[-1]["trained"]) if sets else "—"
             taken = f"{steps:>10,} of {run.cell.steps_to_take:,} steps"
             if (limit := run.cell.episodes_to_take) is not None:
                 taken += f", {episodes_of(ledger):,} of {limit:,} episodes"
@@ -200,6 +201,15 @@ def or_episodes(manifest: Manifest) -> str:
     return (
         ", or fewer, where episodes end runs" if others or limit is None else f", or {counted(limit, 'episode')} a run"
     )
+
+
+def print_stand(
+    place: Grid, manifest: Manifest, found: Sequence[RunStatus], by_cause: bool, queue: Queue | None
+) -> None:  # fmt: skip
+    """All that `grid status` shows of a grid."""
+    print_cells(manifest, found)
+    print_failures(found, by_cause)
+    say(summary(manifest, found) + workers_in_words(place, queue))
 
 
 def print_failures(found: Sequence[RunStatus], by_cause: bool) -> None:

@@ -29,7 +29,7 @@ from space_dist.cli.grids import (
     started_ahead,
     tell_results_elsewhere,
 )
-from space_dist.cli.overview import Watching, display, fits, print_failures, summary, workers_in_words
+from space_dist.cli.overview import Watching, display, fits, print_failures, status_json, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
 from space_dist.errors import ConfigError
 from space_dist.system.extras import needed_from
@@ -130,7 +130,7 @@ def tune_status(
 
     place = find_tune(tune, root_of(root))
     tell_results_elsewhere(place)
-    watched, watching = WatchedQueue(place.folder), Watching()
+    watched, watching, shown = WatchedQueue(place.folder), Watching(), (dict[str, Any](), dict[str, Any]())
     while True:
         queue = watched.now()
         manifest = place.manifest()
@@ -138,9 +138,13 @@ def tune_status(
         waiting = {trial.cell for trial in search.open}
         found = run_statuses_of(place, manifest, [run for run in manifest.runs() if run.cell.id in waiting])
         settled = bool(found) and all(one.condition in ("done", "failed") for one in found)
-        if as_json:
-            told = {"folder": str(place.folder), "owner_alive": place.owner_alive()} | _numbers(search)
-            print_json(told | ({} if queue is None else {"slurm": queue.to_json()}))
+        told = {"folder": str(place.folder), "owner_alive": place.owner_alive()} | _numbers(search)
+        told |= {} if queue is None else {"slurm": queue.to_json()}
+        now = told, status_json(manifest, place, found)
+        if now == shown and not console.is_terminal:  # a file or a pipe keeps what it was told
+            pass
+        elif as_json:
+            print_json(told)
         else:
             if watch and console.is_terminal:
                 console.clear()
@@ -149,6 +153,7 @@ def tune_status(
             say(_summary(manifest, search))
             if found:
                 say(f"now: {summary(manifest, found)}{workers_in_words(place, queue)}")
+        shown = now
         idle = not place.owner_alive() and not (queue and queue.live)
         held_up = settled and any(one.condition == "failed" for one in found) and idle
         if not watch or output_left() or search.over or held_up or watching.is_over(place, queue, found):
