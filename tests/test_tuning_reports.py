@@ -106,6 +106,34 @@ def test_a_confirmation_of_something_else_is_none(tmp_path: Path) -> None:
     assert "has seeds of the search" in build_search_report(grid).summary[1]
 
 
+def test_the_report_names_which_step_to_a_confirmation_is_missing(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+
+    def what_is_missing(grid: Grid) -> str:
+        return build_search_report(grid).summary[1]
+
+    grid, manifest = search_through(write_tune(tmp_path, trials=2, sampler={"kind": "random"}), root)
+    assert f"`space-dist tune confirm {grid.folder}` writes the grid" in what_is_missing(grid)
+    written = confirmation(grid, manifest)
+    to_run = f"`space-dist grid run {written} --root {root}` runs the grid"
+    assert to_run in what_is_missing(grid)
+    plan(written, root)
+    assert to_run not in what_is_missing(grid)
+
+    before = {arm: search_of(manifest).best(arm) for arm in search_of(manifest).arms}
+    grid, manifest = search_through(write_tune(tmp_path, trials=8, sampler={"kind": "random"}), root)
+    assert {arm: search_of(manifest).best(arm) for arm in search_of(manifest).arms} != before
+    assert f"`space-dist tune confirm {grid.folder}` writes the grid that does it anew" in what_is_missing(grid)
+    confirmation(grid, manifest)
+    assert "has another setting of" in what_is_missing(grid)
+    assert to_run in what_is_missing(grid)
+    plan(written, root)
+    assert "not confirmed yet" not in what_is_missing(grid)
+    written.write_text("seeds: 3\n")
+    (root / "search-confirm/manifest.json").unlink()
+    assert "tune confirm" in what_is_missing(grid)
+
+
 def test_importance_finds_what_decides(tmp_path: Path) -> None:
     _, manifest = search_through(
         write_tune(tmp_path, trials=20, generation=20, seeds=[0], search={
@@ -195,7 +223,9 @@ def test_commands_tell_how_a_search_stands(
     found = json.loads(said("status", path, "--json"))
     assert (found["over"], found["counts"]) == (True, {"complete": 12})
     assert "report.html" in said("report", root / "search")
-    assert "grid run" in said("confirm", path)
+    told = " ".join(said("confirm", path).split())
+    assert "grid run" in told
+    assert f"`space-dist tune report {root / 'search'}` shows it" in told
     assert "12 complete" in said("run", path)  # nothing is left to do
     assert "12 complete" in said(path)  # the same, in short
     assert "12 complete" in said(root / "search")

@@ -205,7 +205,10 @@ def tune_confirm(tune: TunePath, root: Root = None) -> None:
     for arm in search.arms:
         best = search.best(arm)
         say(f"{arm}: trial {best.number if best is not None else ''}")
-    say(f"`space-dist grid run {written} --root {place.folder.parent}` runs it; `space-dist tune report` shows it")
+    say(
+        f"`space-dist grid run {written} --root {place.folder.parent}` runs it; "
+        f"`space-dist tune report {place.folder}` shows it"
+    )
     if (place.folder / JOBS).exists():
         beside = place.folder.with_name(confirmation_of(manifest.name))
         say(f"on SLURM: `space-dist slurm export {written} --out {beside}`, with your --profile, then its submit.sh")

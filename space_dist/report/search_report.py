@@ -17,8 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from space_dist import config as configs
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.experiment.manifest import Cell, Grid, Manifest
+from space_dist.experiment.manifest import Grid, Manifest
 from space_dist.experiment.sampling import FEWEST_WEIGHED, importance
 from space_dist.experiment.search import Search, Trial
 from space_dist.experiment.status import run_statuses
@@ -278,14 +279,14 @@ def _confirmation(
     if not search.over:
         return [], None, f"{none}: `space-dist tune run {grid.folder}` goes on, and what it chooses is confirmed then."
     if not confirming.manifest_file.exists():
-        where = f"whose runs are looked for in {confirming.folder}"
-        return [], None, f"{none}: `space-dist tune confirm {grid.folder}` writes the grid that does it, {where}."
+        where = f"its runs are looked for in {confirming.folder}"
+        return [], None, f"{none}: {where}; {_next_step(grid, manifest, search)}."
     try:
         found = confirming.manifest()
     except LedgerError as error:
         return [], None, f"{none}: {error}."
-    if fault := _not_of_this(found, manifest, search):
-        return [], None, f"{none}: {confirming.folder} {fault}; `space-dist tune confirm {grid.folder}` writes it anew."
+    if fault := _not_of_this(_frozen_choice(found, search), manifest, search):
+        return [], None, f"{none}: {confirming.folder} {fault}; {_next_step(grid, manifest, search)}."
     made = build_grid_report(confirming, out / "confirmation", in_depth=False)
     curves = made.folder / "curves.png"
     pictures = [
@@ -301,28 +302,65 @@ def _confirmation(
     return [Section("Confirmation", text, made.table, made.remarks, pictures)], made, f"Confirmation: {done}"
 
 
-def _not_of_this(found: Manifest, manifest: Manifest, search: Search) -> str:
-    """Why a grid confirms nothing of this search; empty if it does."""
-    if {*found.seeds} & {*manifest.seeds}:
-        return "has seeds of the search"
-    cells = {Path(str(cell.settings.get("extends", ""))).stem: cell for cell in found.cells}
+@dataclass(frozen=True)
+class _Choice:
+    """What a grid confirms, frozen or only written: the run config of each arm, and the seeds of all."""
+
+    seeds: Sequence[int]
+    configs: Mapping[str, Mapping[str, Any]]
+
+
+def _frozen_choice(found: Manifest, search: Search) -> _Choice:
+    cells = {Path(str(cell.settings.get("extends", ""))).stem: cell.config for cell in found.cells}
     if len(search.arms) == 1 and len(found.cells) == 1:
-        cells = {next(iter(search.arms)): found.cells[0]}
-    if cells.keys() != search.arms.keys():
+        cells = {next(iter(search.arms)): found.cells[0].config}
+    return _Choice(found.seeds, cells)
+
+
+def _written_choice(file: Path) -> _Choice:
+    """Raises ConfigError where `tune confirm` has written none, or somebody something else."""
+    try:
+        whole = configs.read_yaml(file)
+        arms = {Path(name).stem: configs.read_yaml(file.with_name(Path(name).name)) for name in whole["extends"]}
+        for config in arms.values():  # relative to the folder of the file, which is one below the search's
+            config["instances"] = {split: path.removeprefix("../") for split, path in config["instances"].items()}
+        return _Choice([*whole["seeds"]], arms)
+    except (AttributeError, KeyError, TypeError):
+        raise ConfigError(f"{file} is not as it was written") from None
+
+
+def _next_step(grid: Grid, manifest: Manifest, search: Search) -> str:
+    """Which of the two steps to a confirmation is missing: to write the grid of what was chosen, or to run it."""
+    file = grid.folder / "confirm" / f"{confirmation_of(manifest.name)}.yaml"
+    try:
+        is_written = not _not_of_this(_written_choice(file), manifest, search)
+    except ConfigError:
+        is_written = False
+    if is_written:
+        return f"`space-dist grid run {file} --root {grid.folder.parent}` runs the grid that does it"
+    anew = " anew" if file.exists() else ""
+    return f"`space-dist tune confirm {grid.folder}` writes the grid that does it{anew}, which is to be run then"
+
+
+def _not_of_this(choice: _Choice, manifest: Manifest, search: Search) -> str:
+    """Why a grid confirms nothing of this search; empty if it does."""
+    if {*choice.seeds} & {*manifest.seeds}:
+        return "has seeds of the search"
+    if choice.configs.keys() != search.arms.keys():
         return "has other arms than the search"
-    for arm, cell in cells.items():
+    for arm, config in choice.configs.items():
         best = search.best(arm)
         first, schedule = ({}, []) if best is None else search.in_force(best)
-        same = all(_same(cell, key, value) for key, value in first.items())
-        if best is None or not same or list(cell.config.get("schedule", ())) != schedule:
+        same = all(_same(config, key, value) for key, value in first.items())
+        if best is None or not same or list(config.get("schedule", ())) != schedule:
             return f"has another setting of {arm} than the search has chosen"
-        if dict(cell.config["instances"]) != dict(search.final):
+        if dict(config["instances"]) != dict(search.final):
             return "has other instances than confirm.instances names"
     return ""
 
 
-def _same(cell: Cell, key: str, value: Any) -> bool:
-    found: Any = cell.config
+def _same(config: Mapping[str, Any], key: str, value: Any) -> bool:
+    found: Any = config
     for part in key.split("."):
         found = found.get(part) if isinstance(found, Mapping) else None
     if isinstance(value, Mapping):  # a whole section: defaults were added to it
