@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import random
+import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,32 @@ def test_hostile_searches_are_refused_in_a_sentence(
     assert "tune.yaml" in text or "nowhere.yaml" in text
     assert len(text) < 2000
     assert not list(tmp_path.glob("runs/*/manifest.json"))
+
+
+@pytest.mark.parametrize(
+    ("sections", "told"),
+    [
+        ({"arms": arm(set={"curriculum": {"kind": "spce"}})}, "arms.space.set: curriculum.kind: 'spce' is not known"),
+        ({"search": {"learner.learnin_rate": RATE}},
+         "search: learner.learnin_rate: unknown key; did you mean 'learning_rate'"),
+        ({"arms": arm(search={"curriculum.kapa": {"int": [1, 2]}})},
+         "arms.space.search: curriculum.kapa: unknown key"),
+        ({"set": {**SMALL, "learner.n_stps": 3}}, "set: learner.n_stps: unknown key"),
+    ],
+)  # fmt: skip
+def test_a_fault_is_told_where_the_file_has_it(sections: dict[str, Any], told: str, tmp_path: Path) -> None:
+    path = write_tune(tmp_path, **sections)
+    with pytest.raises(ConfigError) as caught:
+        plan_search(path, tmp_path / "runs")
+    assert str(caught.value).startswith(f"{path}: {told}")
+
+
+def test_a_fault_of_the_run_config_names_it(tmp_path: Path) -> None:
+    base = tmp_path / "base.yaml"
+    text = (ROOT / "configs/pointmass_round_robin.yaml").read_text()
+    base.write_text(text.replace("instances/", f"{ROOT}/configs/instances/").replace("gamma:", "gama:"))
+    with pytest.raises(ConfigError, match=r"tune\.yaml: extends: base\.yaml: learner\.gama: unknown key"):
+        plan_search(write_tune(tmp_path, extends="base.yaml"), tmp_path / "runs")
 
 
 def test_every_field_of_a_search_is_explained() -> None:
@@ -409,12 +436,12 @@ def test_a_search_goes_on_from_what_its_folder_holds(tmp_path: Path) -> None:
     grid, manifest = search_through(path, root)
     alone, _ = search_through(path, tmp_path / "alone")
     assert grid.manifest_file.read_bytes() == alone.manifest_file.read_bytes()
-    with pytest.raises(ConfigError, match="began with another seed"):
+    with pytest.raises(ConfigError, match="planned with another seed"):
         plan_search(write_tune(tmp_path, extends=str(base), seed=3), root)
     other = {"learner.learning_rate": {**RATE, "float": [1e-5, 1e-2]}}
-    with pytest.raises(ConfigError, match=r"began with another search\.learner\.learning_rate\.float"):
+    with pytest.raises(ConfigError, match=r"planned with another search\.learner\.learning_rate\.float"):
         plan_search(write_tune(tmp_path, extends=str(base), search=other), root)
-    with pytest.raises(ConfigError, match="may get more trials, and not fewer"):
+    with pytest.raises(ConfigError, match=r"with 6, and 6 of each arm were asked; .* not fewer than were asked"):
         plan_search(write_tune(tmp_path, extends=str(base), trials=4), root)
     path = write_tune(tmp_path, extends=str(base), trials=8)
     grid, more = search_through(path, root)
@@ -425,6 +452,30 @@ def test_a_search_goes_on_from_what_its_folder_holds(tmp_path: Path) -> None:
     base.write_text(base.read_text().replace("gamma: 0.95", "gamma: 0.9"))
     with pytest.raises(ConfigError, match="the run config that it extends"):
         plan_search(path, root)
+
+
+def test_a_plan_binds_no_more_than_what_was_asked(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    grid, done = search_through(write_tune(tmp_path, trials=2), root)
+    ended = grid.manifest_file.read_bytes()
+    plan_search(write_tune(tmp_path, trials=3), root)  # a third was planned, and not asked
+    assert plan_search(write_tune(tmp_path, trials=2), root).manifest == done
+    assert grid.manifest_file.read_bytes() == ended
+    with pytest.raises(ConfigError, match="planned with 2, and 2 of each arm were asked") as told:
+        plan_search(write_tune(tmp_path, trials=1), root)
+    assert "remove" not in str(told.value)  # runs of it are there
+    search_through(write_tune(tmp_path, trials=3), root)
+    with pytest.raises(ConfigError, match="where those it has are a multiple of generation: 2"):
+        plan_search(write_tune(tmp_path, trials=4), root)
+
+
+def test_a_search_of_which_nothing_has_run_says_what_frees_its_name(tmp_path: Path) -> None:
+    grid = plan_search(write_tune(tmp_path), tmp_path / "runs").grid
+    for other in (write_tune(tmp_path, seed=3), write_tune(tmp_path, trials=1)):
+        with pytest.raises(ConfigError, match=f"since nothing of it has run yet, remove {grid.folder}$"):
+            plan_search(other, tmp_path / "runs")
+        plan_search(other, tmp_path / "elsewhere")
+        shutil.rmtree(tmp_path / "elsewhere")
 
 
 def test_another_optuna_draws_nothing_in_a_search_of_this_one(tmp_path: Path) -> None:

@@ -229,6 +229,14 @@ def test_commands_tell_how_a_search_stands(
     assert "12 complete" in said("run", path)  # nothing is left to do
     assert "12 complete" in said(path)  # the same, in short
     assert "12 complete" in said(root / "search")
+    assert "12 complete" in said("search")  # by its name below the root
+    assert "12 complete" in said("run", "search")
+    write_tune(tmp_path, seed=5, trials=8)
+    for what in ("status", "report"):
+        assert command(monkeypatch, "tune", what, path, "--root", root) == 0
+        told = " ".join(capsys.readouterr().err.split())
+        assert f"tune.yaml has another seed and 1 other key than the search that {root / 'search'} holds" in told
+    write_tune(tmp_path)
     assert "141" not in said("report", path)
     confirming = plan(root / "search/confirm/search-confirm.yaml", root)
     for run in confirming.manifest.runs():

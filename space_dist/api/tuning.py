@@ -11,7 +11,7 @@ from space_dist.api.arguments import as_limit, as_path, refuse_progress
 from space_dist.api.grids import GridRun, worked_through
 from space_dist.api.progress import line_of_grid, shown
 from space_dist.errors import ConfigError
-from space_dist.experiment.manifest import Grid, Manifest
+from space_dist.experiment.manifest import Grid, Manifest, in_root
 from space_dist.experiment.tuning import find_tune
 from space_dist.grid.conductor import Overview, working_on
 from space_dist.grid.fork_server import ForkServer
@@ -34,9 +34,9 @@ def run_search(
 ) -> GridRun:
     """Work through a search on this machine, as `space-dist tune run` does: what is done is skipped.
 
-    search: its YAML file, `shipped:NAME`, or its folder.  root: the folder that holds searches' folders; None: `runs`
-    here.  max_parallel: runs at a time; None: as many as there are CPUs for.  progress: show a line that changes in its
-    place; or what is called now and then.
+    search: its YAML file, `shipped:NAME`, its folder, or its name below `root`.  root: the folder that holds searches'
+    folders; None: `runs` here.  max_parallel: runs at a time; None: as many as there are CPUs for.  progress: show a
+    line that changes in its place; or what is called now and then.
 
     `manifest.search.trials` of what is returned has every trial: `arm`, `parameters`, `state`, and the `value` that it
     reached (None unless it is complete). Trials that fail are recorded as
@@ -66,7 +66,8 @@ def run_search(
 
 
 def planned(path: Path, root: Path) -> Grid:
-    """The search a user wants to run, planned below `root` from YAML, or as it lies in its folder."""
+    """The search a user wants to run, planned below `root` from YAML, or as it lies in its folder, there or here."""
+    path = in_root(path, root)
     if path.is_dir():
         return find_tune(path, root)
     with needed_from("tune", "a search"):

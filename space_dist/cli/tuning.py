@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -31,7 +32,7 @@ from space_dist.cli.grids import (
 )
 from space_dist.cli.overview import Watching, display, fits, print_failures, status_json, summary, workers_in_words
 from space_dist.cli.terminal import STOP, Json, console, output_left, say, warn
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, counted
 from space_dist.system.extras import needed_from
 
 if TYPE_CHECKING:
@@ -44,14 +45,25 @@ _FAILED, _UNFINISHED = 1, 3  # exit codes of `tune status`
 
 
 class _RunsFiles(TyperGroup):
-    """`space-dist tune TUNE`, a file or a search's folder, is `space-dist tune run TUNE`."""
+    """`space-dist tune TUNE`, a search's file, folder or name, is `space-dist tune run TUNE`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Of the words behind `tune`, the first of which names a command, a file or a folder."""
+        """Of the words behind `tune`, the first of which names a command, a file, a folder or a search."""
         if args and args[0] not in self.commands:
             named = args[0].endswith(_FILES) or args[0].startswith("shipped:") or Path(args[0]).is_dir()
-            args = ["run", *args] if named else args
+            args = ["run", *args] if named or _is_in_root(args[0], args[1:]) else args
         return super().resolve_command(ctx, args)
+
+
+def _is_in_root(name: str, words: Sequence[str]) -> bool:
+    """Whether a search or grid is called so below the `--root` that is among these words."""
+    if len(Path(name).parts) != 1:
+        return False
+    from space_dist.experiment.manifest import Grid
+
+    named = next((word.partition("=")[2] for word in words if word.startswith("--root=")), None)
+    behind = next((after for word, after in pairwise(words) if word == "--root"), named)
+    return Grid(root_of(None if behind is None else Path(behind)) / name).manifest_file.exists()
 
 
 tune_app = typer.Typer(
@@ -60,7 +72,10 @@ tune_app = typer.Typer(
 )  # fmt: skip
 
 TunePath = Annotated[
-    Path, typer.Argument(metavar="TUNE", help="A search's YAML file, or its folder.", show_default=False)
+    Path,
+    typer.Argument(
+        metavar="TUNE", help="A search's YAML file, its folder, or its name below --root.", show_default=False
+    ),
 ]
 
 
@@ -125,10 +140,9 @@ def tune_status(
     by_cause: Annotated[bool, typer.Option("--by-cause", help="Group what is not done by why.")] = False,
 ) -> None:
     """Where every trial stands. Exit codes: 0 over, 1 held up by failures, 3 unfinished, 2 there is no such search."""
-    from space_dist.experiment.tuning import find_tune
     from space_dist.slurm.queue import WatchedQueue
 
-    place = find_tune(tune, root_of(root))
+    place = _found(tune, root_of(root))
     tell_results_elsewhere(place)
     watched, watching, shown = WatchedQueue(place.folder), Watching(), (dict[str, Any](), dict[str, Any]())
     while True:
@@ -172,12 +186,11 @@ def tune_report(
 ) -> None:
     """The search, the importance of its settings, and apart from it what was confirmed."""
     from space_dist.cli.runs import print_grid_report
-    from space_dist.experiment.tuning import find_tune
 
     with needed_from("tune", "the report of a search"):
         from space_dist.report.search_report import build_search_report
 
-    place = find_tune(tune, root_of(root))
+    place = _found(tune, root_of(root))
     made = build_search_report(place, out)
     how_far, of_confirmation = made.summary
     say(how_far)
@@ -192,13 +205,13 @@ def tune_report(
 @tune_app.command("confirm")
 def tune_confirm(tune: TunePath, root: Root = None) -> None:
     """Write the grid that runs the best setting of each arm with fresh seeds on the final instances."""
-    from space_dist.experiment.tuning import confirmation_of, find_tune
+    from space_dist.experiment.tuning import confirmation_of
     from space_dist.slurm.export import JOBS
 
     with needed_from("tune", "a search"):
         from space_dist.grid.tuning import confirmation
 
-    place = find_tune(tune, root_of(root))
+    place = _found(tune, root_of(root))
     manifest = place.manifest()
     written = confirmation(place, manifest)
     search = _search_of(place, manifest)
@@ -227,6 +240,21 @@ def tell_outcome(place: Grid, manifest: Manifest) -> None:
 
 
 # ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def _found(tune: Path, root: Path) -> Grid:
+    """A search that was planned before; where its file has changed since, that is said: it decides nothing here."""
+    from space_dist.experiment.tuning import differences, find_tune
+
+    place = find_tune(tune, root)
+    changed = differences(tune, _search_of(place, place.manifest()).config)
+    if changed:
+        more = f" and {counted(len(changed) - 1, 'other key')}" if len(changed) > 1 else ""
+        warn(
+            f"{tune} has another {changed[0]}{more} than the search that {place.folder} holds, of which this tells; "
+            "`space-dist tune plan` says whether it may still change"
+        )
+    return place
 
 
 def _search_of(place: Grid, manifest: Manifest) -> Search:

@@ -486,3 +486,14 @@ def find_tune(path: Path, root: Path) -> Grid:
             "(--root names another root)"
         )  # fmt: skip
     return grid
+
+
+def differences(path: Path, frozen: Mapping[str, Any]) -> list[str]:
+    """The keys, sorted, in which a search's file is another than what is frozen; none if `path` is a folder or a name.
+
+    frozen: `Search.config`.
+    """
+    if not path.is_file():
+        return []
+    now = json.loads(json.dumps(load_tune(path).model_dump(mode="json")))
+    return [*configs.changes(json.loads(json.dumps(frozen)), now)]

@@ -103,28 +103,18 @@ def _continued(grid: Grid, begun: Manifest, planned: Search) -> Manifest:
     forbidden = [key for key in changes if key.partition(".")[0] not in _MAY_CHANGE]
     if forbidden:
         raise ConfigError(
-            f"{grid.folder} holds another search of this name, which began with another {forbidden[0]}; a search that "
-            f"has begun may change {', '.join(_MAY_CHANGE)}. Give it another name, or use another --root"
+            f"{grid.folder} holds another search of this name, which was planned with another {forbidden[0]}; a search "
+            f"that is planned may change {', '.join(_MAY_CHANGE)}. {_ways_out(grid, begun)}"
         )
     if {**before, "config": 0} != {**now, "config": 0}:
         raise ConfigError(
             f"{grid.folder} holds another search of this name: the run config that it extends, or an instance file, "
-            "has changed since. Give it another name, or use another --root"
+            f"has changed since. {_ways_out(grid, begun)}"
         )
     if not changes:
         return begun
-    trials, each = int(search.config["trials"]), int(search.config["generation"])
-    if "trials" in changes and search.config["population"] is not None:
-        raise ConfigError(
-            f"trials: {grid.folder} was begun with a population of {trials}, which cannot change its size"
-        )
-    if int(planned.config["trials"]) < trials:
-        raise ConfigError(f"trials: {grid.folder} was begun with {trials}; a search may get more trials, and not fewer")
-    if "trials" in changes and trials % each and len(search.trials) == search.total:
-        raise ConfigError(
-            f"trials: the last generation of {grid.folder} was asked with {trials % each} trials of {each}; a search "
-            f"may get more trials where they are a multiple of generation: {each}"
-        )
+    if "trials" in changes:
+        _refuse_trials(grid, begun, int(planned.config["trials"]))
     if grid.owner_alive():
         raise ConfigError(f"{grid.folder} is being worked on; `space-dist grid stop {grid.folder}` ends that")
     config = TuneConfig.model_validate(planned.config)
@@ -134,6 +124,37 @@ def _continued(grid: Grid, begun: Manifest, planned: Search) -> Manifest:
     )  # fmt: skip
     grid.freeze(manifest, {})
     return grid.manifest()
+
+
+def _ways_out(grid: Grid, begun: Manifest) -> str:
+    """What a user may do whose search has the name of another one."""
+    others = "Give it another name, or use another --root"
+    if any(grid.ledger(run).folder.exists() for run in begun.runs()) or begun.searched.generation > 0:
+        return others
+    return f"{others}; or, since nothing of it has run yet, remove {grid.folder}"
+
+
+def _refuse_trials(grid: Grid, begun: Manifest, wanted: int) -> None:
+    """Raise ConfigError where a search that had been planned with so many trials would not have asked the same ones."""
+    search = begun.searched
+    trials, each = int(search.config["trials"]), int(search.config["generation"])
+    if search.config["population"] is not None:
+        raise ConfigError(
+            f"trials: {grid.folder} was planned with a population of {trials}, which cannot change its "
+            f"size. {_ways_out(grid, begun)}"
+        )
+    asked_of_each = search.asked // len(search.arms)
+    # As long as there are more to ask, every generation was asked whole.
+    if wanted < asked_of_each:
+        raise ConfigError(
+            f"trials: {grid.folder} was planned with {trials}, and {asked_of_each} of each arm were asked; a search "
+            f"may get more trials, and not fewer than were asked. {_ways_out(grid, begun)}"
+        )
+    if wanted > trials and trials % each and asked_of_each == trials:
+        raise ConfigError(
+            f"trials: the last generation of {grid.folder} was asked with {trials % each} trials of {each}; a search "
+            f"may get more trials where those it has are a multiple of generation: {each}. {_ways_out(grid, begun)}"
+        )
 
 
 # ---- the plan --------------------------------------------------------------------------------------------------------
@@ -168,7 +189,8 @@ class _Planned:
             space = self.config.space(name, self._known(data))
             if not space:
                 raise ConfigError("nothing to search: no condition of what is named under search holds")
-            setting = self._refuse_what_cannot_be(data, space)
+        setting = self._refuse_what_cannot_be(name, data, space)
+        with about(f"arms.{name}"):
             config = resolved_cell(self.config.name, name, with_settings(data, setting), "")
             if self.config.objective.kind == "worst" and config.evaluation.episodes < 2:
                 raise ConfigError(
@@ -197,7 +219,9 @@ class _Planned:
             whole = data
         return dict(configs.flattened(whole))
 
-    def _refuse_what_cannot_be(self, data: dict[str, Any], space: Mapping[str, Distribution]) -> dict[str, Any]:
+    def _refuse_what_cannot_be(
+        self, arm: str, data: dict[str, Any], space: Mapping[str, Distribution]
+    ) -> dict[str, Any]:
         """Raise ConfigError for a key, or a value of one, that no setting of the space makes a config of.
 
         Returns a setting that is one. Combinations may still be refused: these are failed trials.
@@ -205,18 +229,40 @@ class _Planned:
         fitting: dict[str, Any] = {}
         for key, one in space.items():
             for value in one.extremes():
-                fault = None
+                where, fault = f"arms.{arm}: search: {key}: {value}", None
                 for setting in completions(space, self.config.seed, key, value, _TRIED):
                     try:
-                        resolved_cell(self.config.name, "arm", with_settings(data, setting), f"search: {key}: {value}")
+                        with about(f"arms.{arm}"):
+                            tried = with_settings(data, setting)
+                        resolved_cell(self.config.name, "arm", tried, where)
                     except ConfigError as error:
                         fault = fault or error
                     else:
                         fitting, fault = setting, None
                         break
                 if fault is not None:
-                    raise fault
+                    raise ConfigError(self._at_its_place(str(fault), where, arm)) from fault
         return fitting
+
+    def _at_its_place(self, told: str, where: str, arm: str) -> str:
+        """Faults of a setting, each with the section that has its key in the file, in place of the setting tried."""
+        return "\n".join(
+            f"{self._place_of(key, where, arm)}: {key}: {rest}" if line.startswith(where) and rest else line
+            for line in told.splitlines()
+            for key, _, rest in [line.removeprefix(f"{where}: ").partition(": ")]
+        )
+
+    def _place_of(self, key: str, otherwise: str, arm: str) -> str:
+        """Which section of the file gave a key, or what it is a part of; `otherwise` for one that several may have."""
+        ours = self.config.arms[arm]
+        places = [("search", self.config.search), (f"arms.{arm}.search", ours.search),
+                  (f"arms.{arm}.set", ours.set), ("set", self.config.set)]  # fmt: skip
+        written = [(name, place) for place, keys in places for name in keys]
+        around = [(len(name), place) for name, place in written if f"{key}.".startswith(f"{name}.")]
+        if around:
+            return max(around, key=lambda one: one[0])[1]
+        is_whole = any(name.startswith(f"{key}.") for name, _ in written) or "." not in key
+        return otherwise if is_whole else f"extends: {self.config.extends}"
 
     def _refuse_what_is_never_drawn(self, arms: Mapping[str, ArmRecord]) -> None:
         for key in self.config.search:
