@@ -120,6 +120,8 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         ),
         (["report", CONFIG], ["is the config of one run", "report with the run's folder"]),
         (["train", ROOT / "configs/grids/pointmass_space.yaml"], ["does not exist; did you mean", "/../pointmass_sp"]),
+        (["train", ROOT / "configs/pointmass_spce.yaml"], ["does not exist; did you mean", "/pointmass_space.yaml'"]),
+        (["grid", "plan", ROOT / "configs/slurm/nope.yaml"], ["nope.yaml does not exist.\n"]),
         (["instances", "check", "nowhere.csv"], ["nowhere.csv"]),
         (["instances", "check", str(TRAIN), str(TRAIN)], ["overlap"]),
         (["instances", "check", str(ROOT / "configs/instances/cartpole_train.csv")], ["length", "--env names another"]),

@@ -19,7 +19,9 @@ import pytest
 
 from space_dist import cli
 from space_dist.errors import ConfigError
+from space_dist.experiment.grid_file import load_grid
 from space_dist.experiment.manifest import Grid, Manifest
+from space_dist.experiment.tuning import load_tune
 from space_dist.grid.planning import plan
 from space_dist.slurm import Export, Mode, Profile, export, load_profile
 from space_dist.slurm.export import AGGREGATE, SUBMIT, TRAIN, render
@@ -432,7 +434,8 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
         code, said = run("slurm", "export", GRID, "--out", tmp_path / mode, "--mode", mode, "--set", f"nodes={nodes}")
         assert (code, words in said) == (0, True)
     (tmp_path / "site.yaml").write_text("nodes: 4\n")  # for either mode
-    assert run("slurm", "export", GRID, "--out", tmp_path / "array", "--profile", tmp_path / "site.yaml")[0] == 0
+    code, said = run("slurm", "export", GRID, "--out", tmp_path / "array", "--profile", tmp_path / "site.yaml")
+    assert (code, "warning: nodes: 4 is for --mode cluster; in array mode" in " ".join(said.split())) == (0, True)
     assert run("slurm", "export", out, "--out", tmp_path / "copy")[0] == 0
     code, said = run("slurm", "export", out, "--out", tmp_path / "copy", "--mode", "arry")
     assert (code, "did you mean 'array'?" in said) == (2, True)
@@ -709,3 +712,45 @@ def test_bash_and_shellcheck_object_to_no_script(manifest: Manifest, tmp_path: P
     assert found.stdout + found.stderr == ""
     found = subprocess.run(["shellcheck", *(ROOT / "tests/slurm").glob("*.sh")], capture_output=True, text=True)
     assert found.stdout + found.stderr == ""
+
+
+def test_what_a_profile_leaves_empty_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "site.yaml").write_text("partition: cpu\ntime:\ngres:\njob_name:\n")
+    words = ["slurm", "export", GRID, "--out", tmp_path / "out", "--profile", tmp_path / "site.yaml"]
+    assert command(monkeypatch, *words, "--set", "partition=") == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "warning: partition, time, gres: empty, so jobs get what the cluster gives by default" in told
+    assert "#SBATCH --time" not in (tmp_path / "out" / TRAIN).read_text()
+    with pytest.raises(ConfigError, match="partition: write several as one text, cpu,long, not"):
+        load_profile(None, ["partition=[cpu, long]"])
+
+
+def test_grids_searches_runs_and_profiles_are_told_apart() -> None:
+    for path, kind in ((GRID, "a grid"), (ROOT / "configs/tune/pointmass.yaml", "a search"),
+                       (ROOT / "configs/pointmass_space.yaml", "the config of one run")):  # fmt: skip
+        with pytest.raises(ConfigError) as caught:
+            load_profile(path)
+        assert str(caught.value).startswith(f"{path} is {kind}: space-dist ")
+        assert str(caught.value).endswith(". A SLURM profile has keys like partition, account and time")
+    for reading in (load_grid, load_tune):
+        with pytest.raises(ConfigError) as caught:
+            reading(SITE)
+        told = f"{SITE} is a SLURM profile: space-dist slurm export GRID --out DIR --profile {SITE}"
+        assert str(caught.value) == told
+
+
+def test_where_sbatch_takes_nothing_that_is_said(grid: Grid, manifest: Manifest, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    export(Export(manifest, Profile(), "array"), grid.instance_files(manifest), out)
+    stand_in = tmp_path / "bin" / "sbatch"
+    stand_in.parent.mkdir()
+    stand_in.write_text("#!/bin/sh\necho 'sbatch: fatal: Could not establish a configuration source' >&2\nexit 1\n")
+    stand_in.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{stand_in.parent}:{os.environ['PATH']}"}
+    done = subprocess.run([out / SUBMIT], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[1:] == [
+        "submit.sh: nothing was submitted; ./submit.sh tries again, once what is said above is mended"
+    ]

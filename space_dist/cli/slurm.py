@@ -108,7 +108,8 @@ def slurm_export(
     at_most = "" if manifest.search is None else "at most "
     runs = counted(made.n_runs, "run")
     say(f"{manifest.name}: {at_most}{runs} in {tasks}; {out / 'README.md'} says what to do with it")
-    for remark in filter(None, (made.tracking_remark(out), made.import_remark(), made.time_remark())):
+    settings_told = made.time_remark(), made.empty_remark(), made.nodes_remark()
+    for remark in filter(None, (made.tracking_remark(out), made.import_remark(), *settings_told)):
         warn(f"warning: {remark}")
     if check:
         _check_environment(site)

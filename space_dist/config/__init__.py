@@ -69,6 +69,8 @@ from space_dist.config.reading import (
     parse,
     put,
     read,
+    refuse_all_but_profiles,
+    refuse_profile,
     told,
 )
 from space_dist.config.run import CHANGEABLE, Change, RunConfig
@@ -160,6 +162,8 @@ __all__ = [
     "read",
     "read_named",
     "read_yaml",
+    "refuse_all_but_profiles",
+    "refuse_profile",
     "schema",
     "shipped_as",
     "shipped_files",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import io
 import re
@@ -16,12 +17,13 @@ from ruamel.yaml.events import AliasEvent
 
 from space_dist.config.quoting import clean, short
 from space_dist.config.sections import MAX_LIST
-from space_dist.errors import ConfigError, nearest
+from space_dist.errors import ConfigError
 
 _MAX_CONFIG_BYTES = 64 << 10  # over twenty times the longest that ships
 _MAX_ALIASES = 20  # each may double what a file means
 _MAX_WORD = 100  # characters of a key
 _MAX_BRACKETS = 200  # open at once
+_ALIKE = 0.65  # of 1: names of files may be anything, so that half of one is no hint at another
 _MAX_NESTING = 50  # the parser is recursive, and so is the check against the schema
 
 
@@ -48,9 +50,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
             content = file.read(_MAX_CONFIG_BYTES + 1)
     except FileNotFoundError:
         folder = path.parent
-        siblings = [str(file) for file in folder.glob("*.yaml")] if folder.is_dir() else []
         above = folder / ".." / path.name
-        hint = f"; did you mean {str(above)!r}?" if above.is_file() else nearest(str(path), siblings)
+        hint = f"; did you mean {str(above)!r}?" if above.is_file() else _beside(path)
         raise ConfigError(f"{path} does not exist{hint}") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
@@ -81,6 +82,13 @@ _Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.cons
 
 class _ValueFaultError(ValueError):
     """A value that no config can hold; its text begins with the key."""
+
+
+def _beside(path: Path) -> str:
+    """A hint at the file in the same folder whose name, its ending aside, is nearly this one."""
+    files = {file.stem: file for file in sorted(path.parent.glob("*.yaml"))} if path.parent.is_dir() else {}
+    close = difflib.get_close_matches(path.stem, files, n=1, cutoff=_ALIKE)
+    return f"; did you mean {str(files[close[0]])!r}?" if close else "."
 
 
 def parse_yaml(content: bytes | str, source: str) -> Any:

@@ -28,6 +28,7 @@ _OF_PROFILES = frozenset((
     "job_name", "mail_type", "mail_user", "max_array_size", "max_requeues", "mem", "mem_per_cpu", "modules", "nodelist",
     "nodes", "output", "partition", "prologue", "qos", "reservation", "signal", "temp", "throttle", "time", "venv",
 ))  # fmt: skip
+_OF_MANY = frozenset(("extends", "grid", "zip", "arms", "seeds"))  # what grids and searches have, and profiles do not
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, to_check: bool = False) -> RunConfig:
@@ -58,10 +59,28 @@ def read(path: Path, *, to_check: bool = False) -> dict[str, Any]:
         what, group, called = ("search", "tune", "run_search") if "arms" in data else ("grid", "grid", "run_grid")
         command = f"plan {path}" if to_check else f"run {path} (from Python: space_dist.{called})"
         raise ConfigError(f"{path} is a {what}, of many runs: space-dist {group} {command}")
-    if not data.keys().isdisjoint(_OF_PROFILES) and data.keys().isdisjoint(RunConfig.model_fields.keys() - {"env"}):
-        raise ConfigError(f"{path} is a SLURM profile: space-dist slurm export GRID --out DIR --profile {path}")
+    refuse_profile(data, path)
     from_its_folder(data, place.absolute().parent)
     return data
+
+
+def refuse_profile(data: Mapping[str, Any], path: Path) -> None:
+    """Raise ConfigError for what is a SLURM profile, and neither a run's config nor a file of many runs."""
+    others = (RunConfig.model_fields.keys() - {"env"}) | _OF_MANY
+    if not data.keys().isdisjoint(_OF_PROFILES) and data.keys().isdisjoint(others):
+        raise ConfigError(f"{path} is a SLURM profile: space-dist slurm export GRID --out DIR --profile {path}")
+
+
+def refuse_all_but_profiles(data: Mapping[str, Any], path: Path) -> None:
+    """Raise ConfigError for what is a run's config, a grid or a search, and no SLURM profile."""
+    if len(data.keys() & {"instances", "curriculum", "learner", "budget"}) > 1:
+        what = f"the config of one run: space-dist train {path}"
+    elif "extends" in data or "arms" in data:
+        kind = "search" if "arms" in data else "grid"
+        what = f"a {kind}: space-dist slurm export {path} --out DIR --profile PROFILE"
+    else:
+        return
+    raise ConfigError(f"{path} is {what}. A SLURM profile has keys like partition, account and time")
 
 
 def from_its_folder(data: dict[str, Any], folder: Path) -> None:

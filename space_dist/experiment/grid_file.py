@@ -268,6 +268,7 @@ def refuse_others(data: Mapping[str, Any], path: Path) -> None:
         raise ConfigError(
             f"{path} is a search: space-dist tune run {path} (from Python: space_dist.run_search). A grid has no `arms`"
         )
+    configs.refuse_profile(data, path)
 
 
 def label_of(point: Mapping[str, Any], axes: Sequence[str]) -> str:

@@ -453,6 +453,7 @@ def load_tune(path: Path) -> TuneConfig:
             raise ConfigError(
                 f"{path} is {what}: space-dist {how} {path} (from Python: space_dist.{called}). A search has `arms`"
             )
+        configs.refuse_profile(data, path)
     return configs.check(TuneConfig, data, str(path))
 
 

@@ -112,6 +112,19 @@ class Export:
             f"until max_requeues. A time above {lead + EARLY_SECONDS} s leaves some for training"
         )
 
+    def empty_remark(self) -> str | None:
+        """What is to be known of keys of the profile that are there and empty."""
+        if not (empty := self.profile.left_to_slurm):
+            return None
+        default = "; without time, the time limit is the partition's" if "time" in empty else ""
+        return f"{', '.join(empty)}: empty, so jobs get what the cluster gives by default{default}"
+
+    def nodes_remark(self) -> str | None:
+        """What is to be known of a profile's nodes in array mode: its file may have them, for the other mode."""
+        if self.mode != "array" or "nodes" not in self.profile.model_fields_set or self.profile.nodes == 1:
+            return None
+        return f"nodes: {self.profile.nodes} is for --mode cluster; in array mode, the default, each task has one node"
+
     @property
     def own_modules(self) -> list[str]:
         """The top-level modules of users' own that runs import: no folder of an export has them."""

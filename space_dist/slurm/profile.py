@@ -43,6 +43,8 @@ _OURS = {
     "array", "chdir", "kill-on-invalid-dep", "ntasks", "ntasks-per-node", "open-mode", "parsable", "requeue",
     "no-requeue", "test-only", "wait", "wrap", "help", "usage", "version",
 }  # fmt: skip
+# Of which null is a choice of its own, and as good as any.
+_NULL_SAYS_MORE = ("job_name", "cpus_per_task", "throttle", "error", "venv", "conda", "apptainer", "interface")
 
 
 def _one_line(value: str) -> str:
@@ -120,11 +122,11 @@ class Profile(Section):
     job_name: Name | None = None
     """Name of the jobs; null: the grid's."""
     partition: Word | None = None
-    """Partition, or several separated by commas."""
+    """Partition, or several separated by commas; null: the cluster's default."""
     account: Word | None = None
-    """Whom to charge."""
+    """Whom to charge; null: the cluster's default for the user."""
     qos: Word | None = None
-    """Quality of service."""
+    """Quality of service; null: the cluster's default."""
     constraint: Word | None = None
     """Features a node must have. Runs give the same bits on every x86-64 CPU with AVX2 and FMA: any of them will do."""
     nodelist: Word | None = None
@@ -134,14 +136,14 @@ class Profile(Section):
     reservation: Word | None = None
     """Reservation."""
     time: str | int | None = None
-    """Time limit of a job, as SLURM writes it (minutes, HH:MM:SS, D-HH:MM:SS, ...). What is not done by then goes on
-    from its checkpoint in the next one."""
+    """Time limit of a job, as SLURM writes it (minutes, HH:MM:SS, D-HH:MM:SS, ...); null: the partition's default.
+    What is not done by then goes on from its checkpoint in the next one."""
     nodes: int = Field(default=2, ge=1, le=10_000)
     """Nodes of the one allocation in cluster mode. Array tasks have one each."""
     cpus_per_task: int | None = Field(default=None, ge=1, le=10_000)
     """CPUs of an array task, or of each node in cluster mode; null: what one run needs (1 + resources.workers)."""
     mem: Memory | int | None = None
-    """Memory of a node's part of a job (megabytes, or with K, M, G, T)."""
+    """Memory of a node's part of a job (megabytes, or with K, M, G, T); null: the cluster's default."""
     mem_per_cpu: Memory | int | None = None
     """Memory for each CPU instead of `mem`."""
     gres: Word | None = None
@@ -204,6 +206,19 @@ class Profile(Section):
     @classmethod
     def _time(cls, value: str | int | None) -> str | int | None:
         return _checked_time(value)
+
+    @field_validator("partition", "constraint", "nodelist", "exclude", "gres", mode="before")
+    @classmethod
+    def _one_text(cls, value: Any) -> Any:
+        if isinstance(value, list) and value and all(isinstance(one, str) for one in value):
+            raise ValueError(f"write several as one text, {','.join(value)}")
+        return value
+
+    @property
+    def left_to_slurm(self) -> list[str]:
+        """The keys that were given empty, where that says no more than that no option is written for them."""
+        given = [name for name in type(self).model_fields if name in self.model_fields_set]
+        return [name for name in given if name not in _NULL_SAYS_MORE and getattr(self, name) is None]
 
     @field_validator("extra")
     @classmethod
@@ -306,6 +321,8 @@ def load_profile(path: Path | None, overrides: Sequence[str] = ()) -> Profile:
     Raises ConfigError with file and key of every fault.
     """
     data: dict[str, Any] = {} if path is None else configs.read_yaml(configs.located(path))
+    if path is not None:
+        configs.refuse_all_but_profiles(data, path)
     for override in overrides:
         configs.apply_override(data, override)
     return configs.check(Profile, data, str(path or "the default profile"), configs.origins(overrides))

@@ -29,6 +29,8 @@ undo() {
   if [ -n "${submitted[*]-}" ]; then
     echo "submit.sh: sbatch refused; cancelling what was submitted: ${submitted[*]}" >&2
     scancel "${submitted[@]}"
+  else
+    echo "submit.sh: nothing was submitted; ./submit.sh tries again, once what is said above is mended" >&2
   fi
 }
 trap undo EXIT
