@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import itertools
 import json
 import os
 import signal
@@ -450,8 +451,8 @@ def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str]
         (cell / f"s{seed}").mkdir(parents=True)
         (cell / f"s{seed}/status.json").touch()
     listed = f"{cell}/s0, {cell}/s1, {cell}/s2 and 2 more"
-    for folder in (cell, cell.parent):
-        code, _, error = run(capsys, "explain", folder)
+    for folder, command in itertools.product((cell, cell.parent), ("explain", "evaluate", "render")):
+        code, _, error = run(capsys, command, folder)  # whatever else it lacks
         told = error.replace("\n", "")
         assert (code, f"; 5 folders below it do, of which one is to be named: {listed}" in told) == (1, True)
 

@@ -103,11 +103,12 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
 
     monkeypatch.setattr(ray, "init", never)
     monkeypatch.setattr("space_dist.run.ray_watch.REACH_SECONDS", 1.0)
+    way_out = ". `ray start --head` starts one there; where no address is given, a run starts a private Ray"
     up = "The current node timed out during startup."
     for address, starts, what in (
         ("local", 5, up),
         ("auto", 1, up),
-        ("127.0.0.1:1", 0, "nobody listens there, for 1 s"),
+        ("127.0.0.1:1", 0, f"nobody listens there, for 1 s{way_out}"),
     ):
         run = config(1, f"resources.address={address}")
         where = rf"at '{address}' \(resources.address, or --address\)"
@@ -116,6 +117,24 @@ def test_a_ray_that_never_starts_is_an_error(cluster_class: Any, monkeypatch: py
             pass
         assert begun == [address] * starts
         begun.clear()
+
+
+@pytest.mark.usefixtures("cluster_class")
+def test_where_no_ray_runs_the_next_step_is_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    import ray
+
+    from space_dist.run.ray_session import join_ray
+
+    def none_runs(**options: Any) -> Any:
+        raise ConnectionError(
+            f"Could not find any running Ray instance at {options['address']}. Please specify the one to connect to by "
+            "setting `--address` flag or `RAY_ADDRESS` environment variable."
+        )
+
+    monkeypatch.setattr(ray, "init", none_runs)
+    with pytest.raises(SpaceDistError, match=r"no Ray runs on this machine\. `ray start --head` starts one") as told:
+        join_ray("auto", 1)
+    assert "RAY_ADDRESS" not in str(told.value)
 
 
 @pytest.mark.usefixtures("cluster_class")

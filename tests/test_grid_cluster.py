@@ -181,6 +181,7 @@ def test_a_dead_job_server_is_one_clear_sentence(cluster: RayHead, tmp_path: Pat
     said = submit.communicate(timeout=PATIENCE)[0]
     assert submit.returncode == 1
     assert "does not answer" in said
+    assert "`ray start --head` on that machine starts one" in " ".join(said.split())
     assert "Traceback" not in said
 
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, say, warn, write
+from space_dist.cli.terminal import STOP, Json, Overrides, console, delivered, one_run, say, warn, write
 from space_dist.errors import ConfigError, about, counted, exits_refused
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def _taken(outcome: Outcome, budget: BudgetConfig) -> str:
 
 
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    run: Annotated[Path, typer.Argument(help="A run's folder.", callback=one_run)],
     instances: Annotated[Path, typer.Option(help="CSV of the instances to evaluate on.")],
     out: Annotated[
         Optional[Path],  # noqa: UP045

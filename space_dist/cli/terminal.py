@@ -212,3 +212,11 @@ def parse_kwargs(given: list[str] | None) -> dict[str, Any]:
         if not isinstance(kwargs[name], bool | int | float | str):
             raise ConfigError(f"--kwarg {one!r}: the value must be a number, a word, true or false")
     return kwargs
+
+
+def one_run(folder: Path) -> Path:
+    """Of an argument: refuse what holds no run, or several, before any option that the command lacks is told."""
+    from space_dist.ledger import Ledger, there
+
+    Ledger(there(folder)).status()
+    return folder

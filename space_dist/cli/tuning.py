@@ -93,8 +93,9 @@ def tune_plan(tune: TunePath, root: Root = None, as_json: Json = False) -> None:
         print_json({"folder": str(made.grid.folder), "steps": made.steps, "new": made.new} | _numbers(search))
         return
     seeds = len(manifest.seeds)
+    product = ((len(search.arms), "arm"), (search.config["trials"], "trial"), (seeds, "seed"))
     say(
-        f"{len(search.arms)} arms x {search.config['trials']} trials x {seeds} seeds = {search.total * seeds} runs, "
+        f"{' x '.join(counted(*factor) for factor in product)} = {counted(search.total * seeds, 'run')}, "
         f"{made.steps:,} environment steps"
         + (" at most: trials that are given up get fewer" if search.config["pruner"] else "")
     )

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from space_dist.cli.terminal import Kwargs, parse_kwargs, say, tell_findings
+from space_dist.cli.terminal import Kwargs, one_run, parse_kwargs, say, tell_findings
 from space_dist.errors import ConfigError
 
 env_app = typer.Typer(no_args_is_help=True, help="Check environments.")
@@ -37,7 +37,7 @@ def env_check(
 
 
 def render(
-    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    run: Annotated[Path, typer.Argument(help="A run's folder.", callback=one_run)],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
     instances: Annotated[
         Optional[str],  # noqa: UP045

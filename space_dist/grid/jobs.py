@@ -417,7 +417,10 @@ def _client(address: str) -> JobSubmissionClient:
             f"have that token in ~/.ray/auth_token ({_first(error)})"
         ) from error
     except (ConnectionError, RuntimeError, ValueError, requests.RequestException) as error:
-        raise SpaceDistError(f"Ray's job server at {address} does not answer: {_first(error)}") from error
+        raise SpaceDistError(
+            f"Ray's job server at {address} does not answer: {_first(error)}. `ray start --head` on that machine "
+            "starts one (--dashboard-host=0.0.0.0 where it is another than this); `space-dist grid run` needs none"
+        ) from error
 
 
 def _first(error: BaseException) -> str:

@@ -23,6 +23,7 @@ from ray.job_config import JobConfig
 from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.run.ray_watch import (
     JOIN_SECONDS,
+    NOBODY_LISTENS,
     SILENT_SECONDS,
     START_SECONDS,
     Note,
@@ -35,6 +36,7 @@ from space_dist.run.ray_watch import (
 )
 
 _OBJECT_STORE_BYTES = 256 << 20  # policies and shards are some MB; Ray's default is 30 % of the memory
+_NONE_RUNS = "Could not find any running Ray"  # Ray's own words
 _STARTS = 5  # of a Ray of our own
 _TURN_SECONDS = 300.0  # that one waits for others to be up
 _LOOK_SECONDS = 0.2  # between two looks whether it is
@@ -88,7 +90,7 @@ def join_ray(
             failures += 1
             what = first_line(error)
             if not ours or failures == _STARTS:
-                raise SpaceDistError(f"Ray cannot be started or reached {where}: {what}") from error
+                raise SpaceDistError(f"Ray cannot be started or reached {where}: {_in_our_words(what)}") from error
             log.warning("Ray did not start (%s); trying again", what)
             ray.shutdown()
             for process in set(psutil.Process().children()) - before:  # halves of a Ray
@@ -97,6 +99,15 @@ def join_ray(
         else:
             found: dict[str, Any] = context.address_info  # type: ignore[attr-defined]
             return {**found, "started": started}
+
+
+def _in_our_words(what: str) -> str:
+    """Why no Ray was found, and what to do then: Ray's own advice names options that are not ours."""
+    if _NONE_RUNS in what:
+        what = "no Ray runs on this machine"
+    elif not what.startswith(NOBODY_LISTENS):
+        return what
+    return f"{what}. `ray start --head` starts one there; where no address is given, a run starts a private Ray"
 
 
 @contextlib.contextmanager

@@ -30,6 +30,7 @@ SILENT_SECONDS = 180.0  # without any answer, after which a Ray is taken to hang
 GONE_SECONDS = 3.0  # that a Ray of our own is refused by: nobody else would start it again
 OTHERS_GONE_SECONDS = 45.0  # that another's is: its head may come back; after 60 s Ray would abort this process
 
+NOBODY_LISTENS = "nobody listens there"  # how a sentence begins, where an address is not a Ray's
 _ASK_SECONDS = 10.0  # for one answer
 _PAUSE_SECONDS = 2.0
 _LOOK_SECONDS = 10.0  # between two looks at which processes a Ray of our own has
@@ -79,7 +80,7 @@ def reach(address: str, raise_if_stopped: Callable[[], None]) -> None:
     while (found := asked(target, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
         raise_if_stopped()
         if time.monotonic() > until:
-            what = "nobody listens there" if found == "gone" else "what listens there does not answer"
+            what = NOBODY_LISTENS if found == "gone" else "what listens there does not answer"
             raise SpaceDistError(f"{what}, for {REACH_SECONDS:.0f} s")
         time.sleep(0.2)
 
