@@ -35,9 +35,9 @@ _WIDE: Final = 1e300  # bounds where none are known
 class ContextBounds:
     """The features of an environment's contexts and the closed interval each may lie in, in the environment's units.
 
-    `names` are the d features, `low` and `high` are `(d,)`. `lower`, by feature: a lower bound that a setting of the
-    environment allows, and that setting, for sentences alone. Raises ConfigError unless the names are distinct, can
-    stand in a CSV header as they are, and low < high, both finite.
+    `names` are the d features, `low` and `high` are `(d,)`. `lower`, by feature: a lower bound that an argument of
+    the environment allows, and that argument, for sentences alone. Raises ConfigError unless the names are distinct,
+    can stand in a CSV header as they are, and low < high, both finite.
     """
 
     names: tuple[str, ...]
@@ -189,12 +189,14 @@ class InstanceSet:
 
 
 def read_csv(
-    path: Path | str, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False
-) -> InstanceSet:
+    path: Path | str, bounds: ContextBounds, columns: Sequence[str] = (), *, if_there: bool = False,
+    named_by: str = "columns",
+) -> InstanceSet:  # fmt: skip
     r"""The instances of a CSV file, checked whole. `shipped:NAME` names one that comes with the package.
 
     The first line names `id`, the features of `bounds` and the further `columns`, in any order, and nothing else; each
     further line is one instance. With `if_there`, `columns` may be missing; a feature among them is a feature.
+    `named_by` is what sentences call whatever names them.
     Cells are separated by commas; spaces around a cell, double quotes around a cell, a byte order mark, `\r\n` and
     blank lines at the end are accepted. Features come back in the order of `bounds`.
 
@@ -207,7 +209,7 @@ def read_csv(
     try:
         _check_kind_and_size(path)
         with path.open("rb") as file:
-            header = _read_header(file, bounds, columns, if_there)
+            header = _read_header(file, bounds, columns, if_there, named_by)
             found = [name for name in columns if name in header]
             ids, numbers = _read_rows(file, header, bounds, found)
         d = len(bounds.names)
@@ -220,7 +222,9 @@ def read_csv(
         raise ConfigError(f"{_shown_path(path)}: cannot be read: {error.strerror}") from error
 
 
-def read_features(path: Path | str, columns: Sequence[str] = ()) -> tuple[InstanceSet, ContextBounds]:
+def read_features(
+    path: Path | str, columns: Sequence[str] = (), *, named_by: str = "columns"
+) -> tuple[InstanceSet, ContextBounds]:
     """The instances of a CSV file whose environment is not known, and the least bounds that they lie in.
 
     All columns but `id` and `columns` are features. Raises ConfigError as `read_csv` does.
@@ -231,7 +235,7 @@ def read_features(path: Path | str, columns: Sequence[str] = ()) -> tuple[Instan
         raise ConfigError(f"{_shown_path(path)}: row 1 names no feature")
     wide = np.full(len(names), _WIDE)
     with about(_shown_path(path)):
-        instances = read_csv(path, ContextBounds(names, -wide, wide), columns)
+        instances = read_csv(path, ContextBounds(names, -wide, wide), columns, named_by=named_by)
     low, high = instances.contexts.min(axis=0), instances.contexts.max(axis=0)
     return instances, ContextBounds(names, low, np.where(high > low, high, low + np.maximum(1.0, np.abs(low))))
 
@@ -343,7 +347,9 @@ def _split(row: int, line: bytes) -> list[bytes]:
     return cells
 
 
-def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], if_there: bool) -> list[str]:
+def _read_header(
+    file: BinaryIO, bounds: ContextBounds, further: Sequence[str], if_there: bool, named_by: str
+) -> list[str]:
     """The names of the columns, as the file orders them: `id`, each feature and the further ones, once each."""
     required = ("id", *bounds.names, *(() if if_there else further))
     expected = ("id", *bounds.names, *further)
@@ -360,12 +366,10 @@ def _read_header(file: BinaryIO, bounds: ContextBounds, further: Sequence[str], 
         raise ConfigError(f"row 1 is blank where the columns must be named: {allowed}")
     known, seen = set(expected), set[str]()
     asked = [name for name in required if name in further and name not in columns]
-    if (
-        asked
-        and (others := [name for name in columns if name not in known])
-        and known.difference(further) <= {*columns}
-    ):
-        raise ConfigError(f"row 1: there is no column {shown(asked[0])}, as was asked for{nearest(asked[0], others)}")
+    if asked and known.difference(further) <= {*columns}:  # the file may well be right, and the name wrong
+        hint = nearest(asked[0], [name for name in columns if name not in known])
+        there = f"There are {_cut(', '.join(columns), 200)}"
+        raise ConfigError(f"row 1: there is no column {shown(asked[0])}, which {named_by} names{hint} {there}")
     for column in columns:
         if column not in known:
             missing = sorted(known.difference(columns))
@@ -461,7 +465,8 @@ def _cell_fault(row: int, columns: Sequence[str], cells: Sequence[bytes], positi
             what = "is outside the bounds" if np.isfinite(float(cell)) else "is not finite"
             least, setting = bounds.lower.get(column, (np.inf, ""))
             if least <= float(cell) < bounds.low[feature]:
-                allowed += f", and from {least:g} with {setting}"
+                # Who reads an instance file may set it by --set, by --kwarg, or, of a run that is done, not at all.
+                allowed += f", and from {least:g} in an environment made with {setting} (env.kwargs)"
         except ValueError:
             what = "is not a number"
     return f"row {row}, column {shown(column)}: {shown(cell)} {what}; allowed is {allowed}"

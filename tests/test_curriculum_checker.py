@@ -122,6 +122,11 @@ def test_a_file_is_read_without_its_environment(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=words) as caught:
             read_features(path)
         assert str(caught.value).startswith(str(path))
+    path.write_text("id,a\n1,2\n")
+    with pytest.raises(
+        ConfigError, match=r"some\.csv: row 1: there is no column 'b', which --column names\. There are"
+    ):
+        read_features(path, ["b"], named_by="--column")
     with pytest.raises(ConfigError, match=r"nowhere\.csv: there is no such file"):
         read_features(tmp_path / "nowhere.csv")
     assert read_features("shipped:instances/cartpole_train.csv")[0].names == ("length",)

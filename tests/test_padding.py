@@ -249,8 +249,8 @@ def test_a_padded_set_is_not_padded_again_and_no_test_set(tmp_path: Path) -> Non
         Blueprint.of(turned).instances()
     without = configs.load(ROOT / "configs/sparse_pointmass_space.yaml", both)
     allowed = (
-        "'gate_width': '0.0' is outside the bounds; allowed is a number in [0.5, 8.0], and from 0 with "
-        "env.kwargs.closed_gates: true (--kwarg closed_gates=true)"
+        "'gate_width': '0.0' is outside the bounds; allowed is a number in [0.5, 8.0], and from 0 in an "
+        "environment made with closed_gates: true (env.kwargs)"
     )
     with pytest.raises(ConfigError, match=re.escape(allowed)):
         Blueprint.of(without).instances()

@@ -93,6 +93,10 @@ def test_columns_of_the_instances_reach_it(example: Path) -> None:
         ('import: "tests.faulty_curricula:nothing"', "made a str, which is no curriculum"),
         ('import: "tests.faulty_curricula:WantsEnsemble"', "it wants the values of an ensemble"),
         ('import: "tests.faulty_curricula:Honest", kwargs: {size: 3}', "unexpected keyword argument 'size'"),
+        (
+            'import: "tests.faulty_curricula:Honest", columns: [nix]',
+            "train.csv: row 1: there is no column 'nix', which curriculum.columns names. There are id, gate_x, ",
+        ),
         ('import: "tests.faulty_curricula:Honest", columns: [gate_x]', "curriculum.columns: 'gate_x' is a feature"),
     ],
 )

@@ -28,7 +28,7 @@ def curriculum_check(
     from space_dist.curricula.checker import DECISIONS, check
     from space_dist.instances import read_features
 
-    chosen, bounds = read_features(instances, column or ())
+    chosen, bounds = read_features(instances, column or (), named_by="--column")
     findings = check(curriculum, chosen, bounds, parse_kwargs(kwarg))
     tell_findings(findings, curriculum)
     say(f"{curriculum}: no fault found in {DECISIONS} decisions on {len(chosen)} instances")

@@ -269,6 +269,11 @@ class RunConfig(Section):
         return tuple(dict.fromkeys(column for one in self.curricula for column in one.columns_read))
 
     @property
+    def columns_key(self) -> str:
+        """The key that names these columns."""
+        return "curriculum.column" if any(hasattr(one, "column") for one in self.curricula) else "curriculum.columns"
+
+    @property
     def libraries(self) -> tuple[str, ...]:
         """Distributions whose arithmetic the decisions of its curricula depend on, beside NumPy."""
         return tuple(dict.fromkeys(library for one in self.curricula for library in one.libraries))

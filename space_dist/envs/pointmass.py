@@ -34,7 +34,7 @@ BOUNDS: Final = ContextBounds(
     names=("gate_x", "gate_width", "friction"),
     low=np.array([-4.0, 0.5, 0.0]),
     high=np.array([4.0, 8.0, 4.0]),
-    lower={"gate_width": (0.0, "env.kwargs.closed_gates: true (--kwarg closed_gates=true)")},
+    lower={"gate_width": (0.0, "closed_gates: true")},
 )
 """PointMass (Klink et al. 2020): centre and width of the gate in the world's length units, friction in 1/s."""
 BOUNDS_WITH_CLOSED_GATES: Final = ContextBounds(BOUNDS.names, np.array([-4.0, 0.0, 0.0]), BOUNDS.high)

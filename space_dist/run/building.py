@@ -96,7 +96,7 @@ class Blueprint:
         """
         files, bounds, columns = self.config.instances, self.spec.context_bounds, self.config.columns_read
         with about("instances.train"):
-            train = read_csv(files.train, bounds, columns)
+            train = read_csv(files.train, bounds, columns, named_by=self.config.columns_key)
         with about("instances.test"):
             test = read_csv(files.test, bounds, columns, if_there=True)
         refuse_overlap(train, test, str(files.train), str(files.test))
