@@ -59,6 +59,7 @@ FAULTS = {
     "NeedsEpisodes": "step() where no episode ended fails: ValueError",
     "Unmakeable": "cannot be made: KeyError: 'no such setting'",
     "nothing": "made a str, which is no curriculum: derive its class from space_dist.curricula.Curriculum",
+    "Scores": "is no curriculum: derive it from space_dist.curricula.Curriculum; 'tests.faulty_curricula' has Honest, ",
     "number": "'tests.faulty_curricula' has no class 'number'",
     "nobody": "'tests.faulty_curricula' has no class 'nobody'",
 }
@@ -103,6 +104,18 @@ def test_arguments_are_passed_on_and_those_of_the_run_are_not_the_configs() -> N
     assert fault.endswith("'sahre'; did you mean 'share'? Its own are: share")
     (fault,) = check(path, instances(), BOUNDS, {"seed": 1}).faults
     assert "curriculum.kwargs: 'seed' comes from the run" in fault
+    (fault,) = check(path, instances(), BOUNDS, {"instances": 1}).faults
+    assert "curriculum.kwargs: 'instances' comes from the run" in fault
+    (fault,) = check(path, instances(), BOUNDS, {"share": "much"}).faults
+    assert "cannot be made of the instances and curriculum.kwargs: TypeError: " in fault
+
+
+def test_a_word_without_a_colon_is_told_what_a_curriculums_import_path_is() -> None:
+    (fault,) = check("tests.two_features.Nobody", instances(), BOUNDS).faults
+    assert fault.endswith("'tests.two_features.Nobody': an import path has a colon: tests.two_features:Generator or "
+                          "tests.two_features:scattered")  # fmt: skip
+    (fault,) = check("space", instances(), BOUNDS).faults
+    assert fault == "curriculum.import 'space': an import path has a colon, like my_package.my_module:MyCurriculum"
 
 
 def test_it_takes_two_instances() -> None:

@@ -14,6 +14,7 @@ import gymnasium as gym
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv  # noqa: F401 - likewise, and allowed
 
+from space_dist.envs import make_batched
 from space_dist.errors import ConfigError
 from space_dist.system.importing import folders_of_user, load, look_in, why_refused
 from tests.commanding import command
@@ -214,6 +215,37 @@ def test_a_module_that_is_not_found_is_told_with_the_nearest_of_the_current_fold
         with pytest.raises(ConfigError) as refusal:
             load(asked, "env.id")
         assert told in str(refusal.value)
+
+
+def test_a_word_without_a_colon_is_told_the_import_path_that_is_meant(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "uncoloned.py").write_text(
+        "import gymnasium as gym\nfrom gymnasium import Wrapper\nclass Lander(gym.Env): pass\ndef other(): pass\n"
+    )
+    (tmp_path / "pack/worlds.py").write_text("def make(): pass\n")
+    (tmp_path / "unsound.py").write_text("raise KeyError('x')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for word, told in (
+        ("uncoloned", "an import path has a colon: uncoloned:Lander"),
+        ("uncoloned.Lander", "an import path has a colon: uncoloned:Lander"),
+        ("uncoloned.other", "an import path has a colon: uncoloned:other"),
+        ("uncoloned.Landr", "an import path has a colon: uncoloned:Lander"),
+        ("uncoloned.py", "an import path has a colon, and no `.py`: uncoloned:Lander"),
+        ("./uncoloned.py", "an import path has a colon, and no `.py`: uncoloned:Lander"),
+        ("Lander", "an import path has a colon: uncoloned:Lander"),
+        ("pack/worlds.py", "an import path has a colon, and no `.py`: pack.worlds:make"),
+        ("unsound.py", "an import path has a colon, and no `.py`: unsound:NAME"),
+        ("own.yaml", "a YAML file is no import path; `space-dist config check own.yaml` checks a config and what"),
+    ):
+        with pytest.raises(ConfigError) as refusal:
+            make_batched(word, 1, context_visible=False)
+        assert str(refusal.value).startswith(f"env.id {word!r}: {told}")
+    for word in ("os.system", "json", "quite_another", "space_dist/PointMas-v0", "unsound"):
+        with pytest.raises(ConfigError, match="is not known"):
+            make_batched(word, 1, context_visible=False)
 
 
 def test_of_carls_modules_only_environments_are_named(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

@@ -205,6 +205,8 @@ def parse_kwargs(given: list[str] | None) -> dict[str, Any]:
         name, equals, value = one.partition("=")
         if not equals or not name.isidentifier():
             raise ConfigError(f"--kwarg {one!r} is not NAME=VALUE")
+        if name in kwargs:
+            raise ConfigError(f"--kwarg {one!r}: {name} is given twice, as {kwargs[name]!r} before; leave one out")
         try:
             kwargs[name] = YAML(typ="safe", pure=True).load(value)
         except YAMLError:

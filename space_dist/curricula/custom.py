@@ -32,6 +32,7 @@ from space_dist.curricula.interface import (
 from space_dist.errors import ConfigError, SpaceDistError, nearest
 from space_dist.instances import ContextBounds, InstanceSet
 from space_dist.system import arguments
+from space_dist.system.import_paths import without_colon
 from space_dist.system.importing import load
 
 KEY: Final = "curriculum.import"
@@ -41,13 +42,16 @@ _STORED: Final = "a state's fields are int, float, bool, None, or NumPy arrays o
 
 
 def load_maker(import_path: str) -> Callable[..., Any]:
-    """The class or function behind an import path. Raises ConfigError if there is none."""
-    module, _, name = import_path.partition(":")
+    """The class or function behind an import path. Raises ConfigError if there is none, or one of no curriculum."""
+    where = f"{KEY} {import_path!r}"
+    module, colon, name = import_path.partition(":")
+    if not colon:
+        example = "an import path has a colon, like my_package.my_module:MyCurriculum"
+        raise ConfigError(f"{where}: {without_colon(import_path, Curriculum) or example}")
     found: Any = load(import_path, KEY)
     if not callable(found):
-        own = [known for known, value in vars(sys.modules[module]).items()
-               if isinstance(value, type) and issubclass(value, Curriculum)]  # fmt: skip
-        raise ConfigError(f"{KEY} {import_path!r}: {module!r} has no class {name!r}{nearest(name, own)}")
+        raise ConfigError(f"{where}: {module!r} has no class {name!r}{nearest(name, _curricula_of(module))}")
+    _refuse_another_class(where, found, module)
     maker: Callable[..., Any] = found
     return maker
 
@@ -66,13 +70,14 @@ def make_custom(
     signature = _signature(found)
     offered: dict[str, Any] = {"seed": seed, "draws": draws, "bounds": bounds}
     given = {each: value for each, value in offered.items() if signature is None or each in signature.parameters}
-    if taken := sorted(set(_FROM_THE_RUN) & set(kwargs)):
+    first = list(signature.parameters)[:1] if signature is not None else []  # which the instances are given as
+    if taken := sorted({*_FROM_THE_RUN, *first} & set(kwargs)):
         raise ConfigError(f"curriculum.kwargs: {taken[0]!r} comes from the run, not from the config; leave it out")
+    refused = f"{where} cannot be made of the instances and curriculum.kwargs"
     try:
         if signature is not None:
             signature.bind(instances, **given, **kwargs)
     except TypeError as error:
-        refused = f"{where} cannot be made of the instances and curriculum.kwargs"
         if (text := _unknown_argument(error, found, kwargs)) is not None:
             raise ConfigError(f"{refused}: {text}") from None
         raise ConfigError(
@@ -83,15 +88,29 @@ def make_custom(
         own = found(instances, **given, **kwargs)
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
         if isinstance(error, TypeError) and (told := _unknown_argument(error, found, kwargs)) is not None:
-            raise ConfigError(f"{where} cannot be made of the instances and curriculum.kwargs: {told}") from error
+            raise ConfigError(f"{refused}: {told}") from error
         text = str(error) if isinstance(error, SpaceDistError) else f"{type(error).__name__}: {str(error)[:200]}"
-        raise ConfigError(f"{where} cannot be made: {text}") from error
+        raise ConfigError(f"{refused if kwargs else f'{where} cannot be made'}: {text}") from error
     if not isinstance(own, Curriculum):
         raise ConfigError(
             f"{where} made a {type(own).__name__}, which is no curriculum: derive its class from "
             "space_dist.curricula.Curriculum"
         )
     return Custom(own, where, instances, draws, bounds)
+
+
+def _curricula_of(module: str) -> list[str]:
+    """The classes of curricula that an imported module has."""
+    return [known for known, value in vars(sys.modules[module]).items()
+            if isinstance(value, type) and issubclass(value, Curriculum)]  # fmt: skip
+
+
+def _refuse_another_class(where: str, found: object, module: str) -> None:
+    """Refuse a class that is no curriculum's before it is called with what it does not expect."""
+    if isinstance(found, type) and not issubclass(found, Curriculum):
+        own = [known for known in _curricula_of(module) if getattr(sys.modules[module], known).__module__ == module]
+        hint = f"; {module!r} has {', '.join(own[:3])}" if own else ""
+        raise ConfigError(f"{where} is no curriculum: derive it from space_dist.curricula.Curriculum{hint}")
 
 
 def _unknown_argument(error: TypeError, found: Callable[..., Any], kwargs: Mapping[str, Any]) -> str | None:

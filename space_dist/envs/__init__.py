@@ -8,7 +8,6 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -41,6 +40,7 @@ from space_dist.envs.sparse_pointmass import BatchedSparsePointMass
 from space_dist.errors import ConfigError, nearest
 from space_dist.instances import ContextBounds
 from space_dist.system import arguments
+from space_dist.system.import_paths import without_colon
 from space_dist.system.importing import load
 
 BATCHED: dict[str, Callable[..., BatchedEnv]] = {
@@ -98,7 +98,8 @@ def make_batched(
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:  # somebody else's code may raise anything
-        raise ConfigError(f"{where} cannot be made: {type(error).__name__}: {str(error)[:200]}") from error
+        of = " of env.kwargs" if kwargs else ""
+        raise ConfigError(f"{where} cannot be made{of}: {type(error).__name__}: {str(error)[:200]}") from error
     _refuse_interface(where, env)
     batched: BatchedEnv = env
     return ContextVisible(batched) if context_visible else batched
@@ -231,11 +232,6 @@ def _alike(module: str, name: str) -> str:
     return nearest(name, found).removesuffix(".")
 
 
-def _example(env_id: str) -> str:
-    """An import path: of a module here that was named alone, or of nobody's."""
-    return f"{env_id}:MyEnv" if Path(f"{env_id.replace('.', '/')}.py").is_file() else "my_package.my_module:make"
-
-
 def _find(env_id: str) -> Callable[..., Any]:
     if env_id in BATCHED:
         return BATCHED[env_id]
@@ -243,9 +239,11 @@ def _find(env_id: str) -> Callable[..., Any]:
         return lambda **kwargs: gym.make(env_id, disable_env_checker=True, **kwargs)
     module, colon, name = env_id.partition(":")
     if not colon:
+        if (told := without_colon(env_id, gym.Env)) is not None:
+            raise ConfigError(f"env.id {env_id!r}: {told}")
         raise ConfigError(
             f"env.id {env_id!r} is not known{nearest(env_id, BATCHED)} Known: {', '.join(BATCHED)}, "
-            f"an id registered with Gymnasium, or an import path: MODULE:NAME, like {_example(env_id)}"
+            f"an id registered with Gymnasium, or an import path: MODULE:NAME, like my_package.my_module:make"
         )
     carl = module.partition(".")[0] == "carl"
     # Only where needed: leaving `catch_warnings` has Python forget what it has warned of already.

@@ -96,7 +96,7 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         # `pkg.py:Name` may be a module of that name, which lacks another.
         if module.endswith(".py") and (module.startswith(".") or f"{module}.".startswith(f"{missing}.")):
-            raise ConfigError(f"{where}: leave out `.py`: {_as_import_path(module, name)}") from None
+            raise ConfigError(f"{where}: leave out `.py`: {as_import_path(module, name)}") from None
         what = f"{type(error).__name__}: {str(error)[:200]}"
         if missing == module.partition(".")[0]:
             hint = nearest(missing, _modules_here())
@@ -116,7 +116,7 @@ def load(import_path: str, key: str, *, of_library: type | None = None) -> objec
     return found
 
 
-def _as_import_path(file: str, name: str) -> str:
+def as_import_path(file: str, name: str) -> str:
     """What names a file's module, and where to start if it lies in no folder below the current one."""
     path = Path(os.path.relpath(file)).with_suffix("")
     if ".." in path.parts:
