@@ -68,6 +68,12 @@ def nearest(word: str, allowed: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else "."
 
 
+def misspelt(word: str, allowed: Iterable[str]) -> str:
+    """The same where `word` may be right and stand in the wrong place: of what it differs from by a letter or so."""
+    close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.82)
+    return f"; did you mean {close[0]!r}?" if close else "."
+
+
 def counted(number: int, what: str) -> str:
     """`1 run`, `2,000 runs`."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"

@@ -254,9 +254,13 @@ def test_unknown_keys_are_named_with_the_nearest(key: str, meant: str, tmp_path:
                                           "a class of your own can set it (learner.import). Allowed here: "),
         ("{kind: dqn, train_freq: 4}", "What Stable-Baselines3 calls train_freq is learner.n_steps or learner.n_epi"),
         ("{kind: ppo, seed: 4}", "learner.seed: unknown key: seed stands outside of learner"),
-        ("{kind: ppo, import: 'a:B', target: 1}", ". What a learner of your own takes stands in kwargs: {'target': 1}"),
-        ("{kind: ppo, kwargs: {target_kl: 1}}", "it names none; 'target_kl' stands beside kwargs: learner.target_kl"),
-        ("{kind: ppo, kwargs: {target_klx: 1}}", "it names none; did you mean 'target_kl'? That stands beside kwargs: "
+        ("{kind: ppo, import: 'a:B', target: 1}", "learner.target: unknown key. What a learner of your own takes "
+                                                  "stands in kwargs: {'target': 1}. Allowed here: "),
+        ("{kind: ppo, import: 'a:B', rate: 0.1}", "learner.rate: unknown key. What a learner of your own takes stands"),
+        ("{kind: ppo, import: 'a:B', n_stesp: 9}", "n_stesp: unknown key; did you mean 'n_steps'? Allowed here: "),
+        ("{kind: ppo, kwargs: {target_kl: 1}}", "learner: import, which names the class of your own that kwargs are "
+                                                "for, is missing; 'target_kl' stands beside kwargs: learner.target_kl"),
+        ("{kind: ppo, kwargs: {target_klx: 1}}", "is missing; did you mean 'target_kl'? That stands beside kwargs: "
                                                  "learner.target_kl"),
         ("{import: 'a:B'}", "learner.kind: this key is required: beside import it says which of Stable-Baselines3's "
                             "classes yours is derived from. Allowed: ppo, trpo, a2c"),
@@ -489,9 +493,13 @@ def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:
 
 def test_what_somebody_elses_code_takes_is_said_to_stand_in_kwargs() -> None:
     told = refusal(SPACE, "env.length=3")
-    assert told.endswith("context_visible. What the environment takes stands in kwargs: {'length': 3}")
+    assert "env.length: unknown key. What the environment takes stands in kwargs: {'length': 3}. Allowed here: " in told
+    told = refusal(SPACE, "env.context_visibel=false")
+    assert told.endswith("unknown key; did you mean 'context_visible'? Allowed here: id, kwargs, context_visible")
     told = refusal(SPACE, "curriculum={kind: custom, import: 'mine:Mine', share: 0.5}")
-    assert told.endswith("What a curriculum of your own takes stands in kwargs: {'share': 0.5}")
+    assert "unknown key. What a curriculum of your own takes stands in kwargs: {'share': 0.5}. Allowed here: k" in told
+    told = refusal(SPACE, "curriculum={kind: custom, import: 'mine:Mine', imports: 'mine:Mine'}")
+    assert told.endswith("unknown key; did you mean 'import'? Allowed here: kind, import, kwargs, columns")
     assert refusal(SPACE, "env.kwarg={length: 3}").endswith("Allowed here: id, kwargs, context_visible")
 
 

@@ -181,8 +181,8 @@ def test_instances_that_ship_are_taken_by_name(name: str | Path) -> None:
         (lambda: CurriculumCallback("space", kapa=2), r"curriculum\.kapa: unknown key; did you mean 'kappa'\?"),
         (lambda: CurriculumCallback("custom", share=0.5),
          r"curriculum\.import: this key is required; as an argument it is written \*\*\{'import': \.\.\.\}\n"
-         r"CurriculumCallback: curriculum\.share: unknown key\. Allowed here: kind, import, kwargs, columns\. "
-         r"What a curriculum of your own takes stands in kwargs: \{'share': 0\.5\}$"),
+         r"CurriculumCallback: curriculum\.share: unknown key\. What a curriculum of your own takes stands in kwargs: "
+         r"\{'share': 0\.5\}\. Allowed here: kind, import, kwargs, columns$"),
         *((lambda path=path: CurriculumCallback("custom", **{"import": path}), sentence) for path, sentence in (
             ("no_such:Own", "^CurriculumCallback: curriculum.import 'no_such:Own': cannot import 'no_such'"),
             ("tests.faulty_curricula:Honset", "^CurriculumCallback: curriculum.import .* has no class 'Honset'; did "

@@ -244,7 +244,10 @@ def test_faults_are_told_in_a_sentence(example: Path, code: str, settings: list[
         (["learner.update=lean"], "update: lean is Stable-Baselines3's update, compiled; with import it must be stock"),
         (["engine=population"], "learner.import says nothing with engine: population"),
         (["engine=auto", "curriculum.aggregate=population"], "and so none for a class that learner.import names"),
-        (["learner.import=null"], "kwargs are arguments of your own class, which import names; it names none"),
+        (
+            ["learner.import=null", "learner.kwargs={target: 3.0, rate: 0.1}"],
+            "learner: import, which names the class of your own that kwargs are for, is empty",
+        ),
     ],
 )
 def test_what_cannot_go_with_it_is_refused_when_a_config_is_read(

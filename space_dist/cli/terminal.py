@@ -116,8 +116,8 @@ from rich.console import Console
 from space_dist.errors import ConfigError, SpaceDistError, nearest
 from space_dist.system.findings import Findings
 
-console = Console()
-errors = Console(stderr=True)
+console = Console(emoji=False)  # else `mine:b: ` becomes a picture
+errors = Console(stderr=True, emoji=False)
 
 Overrides = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads annotations at run time

@@ -18,7 +18,7 @@ from space_dist.config.run import RunConfig
 from space_dist.config.sections import CurriculumSection, EnvConfig
 from space_dist.config.tracking_uri import UriError
 from space_dist.config.wanted import is_choice, item_of, wanted, words_of
-from space_dist.errors import nearest, with_changes
+from space_dist.errors import misspelt, nearest, with_changes
 
 # What scripts with SB3 say, and where a config says it.
 _SB3_NAMES = {
@@ -227,7 +227,10 @@ def _what_is_known(
         return f": {key} stands outside of {path[0]}"
     allowed = _names(model) if model else []
     of_sb3 = _of_sb3_alone(path, data)
-    hint = "." if key in of_sb3 else nearest(key, [*allowed, *of_sb3])
+    taker = _taker(model, data.get(path[0])) if isinstance(given, bool | int | float | str) else None
+    hint = "." if key in of_sb3 else (misspelt if taker else nearest)(key, [*allowed, *of_sb3])
+    if model is not None and (field := model.model_fields.get(key)) is not None:  # what Python calls it
+        hint = f"; did you mean {_key(key, field)!r}?"
     if hint == "." and root is RunConfig and len(path) == 1:  # misspelt, and without its section
         below = {name: f"{section}.{name}" for section in allowed for name in _names_below(section)}
         close = nearest(key, below)
@@ -235,9 +238,8 @@ def _what_is_known(
     told = next((said for name, said in of_sb3.items() if key == name or f" {name!r}?" in hint), "")
     if told:
         return f"{hint} {told}. Allowed here: {', '.join(allowed)}"
-    taker = _taker(model, data.get(path[0])) if isinstance(given, bool | int | float | str) else None
-    way_out = "" if taker is None else f". What {taker} takes stands in kwargs: {short({key: given})}"
-    return f"{hint} Allowed here: {', '.join(allowed)}{way_out}"
+    way_out = "" if taker is None or hint != "." else f" What {taker} takes stands in kwargs: {short({key: given})}."
+    return f"{hint}{way_out} Allowed here: {', '.join(allowed)}"
 
 
 def _of_another_kind(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 from pydantic import Field, field_validator, model_validator
 
 from space_dist.config.sections import Section, own_path, refuse_library
-from space_dist.errors import nearest
+from space_dist.errors import misspelt, nearest
 
 
 class LearnerSection(Section):
@@ -95,16 +95,16 @@ class LearnerSection(Section):
         if self.import_path is not None and getattr(self, "update", "stock") == "lean":
             raise ValueError("update: lean is Stable-Baselines3's update, compiled; with import it must be stock")
         if self.import_path is None and self.kwargs:
-            raise ValueError(
-                f"kwargs are arguments of your own class, which import names; it names none{self._beside_kwargs()}"
-            )
+            lack = "is empty" if "import_path" in self.model_fields_set else "is missing"
+            what = f"import, which names the class of your own that kwargs are for, {lack}"
+            raise ValueError(f"{what}{self._beside_kwargs()}")
         return self
 
     def _beside_kwargs(self) -> str:
-        """Where the first of its kwargs that is a key of its own stands, or resembles one; empty for none."""
+        """Where the first of its kwargs that is a key of its own, or is misspelt, stands; empty for none."""
         keys = type(self).model_fields
         for name in self.kwargs:
-            hint = nearest(name, keys)
+            hint = misspelt(name, keys)
             if (key := next((one for one in keys if f" {one!r}?" in hint), None)) is not None:
                 asked = "" if key == name else f"{hint} That"
                 return f"{asked or f'; {name!r}'} stands beside kwargs: learner.{key}"
