@@ -97,6 +97,14 @@ def test_several_settings_may_stand_behind_one_option(given: str, meant: str) ->
     assert spread(given.split()) == meant.split()
 
 
+def test_a_setting_in_two_words_is_told_that_it_is_one() -> None:
+    for option in ("--set", "--kwarg"):
+        with pytest.raises(ConfigError, match=f"^{option} a.b 4: write it as one word, with `=`: {option} a.b=4$"):
+            spread(["train", "x.yaml", option, "a.b", "4"])
+    for words in (["train", "--set", "a.b", __file__], ["train", "--set", "budget.steps", "--seed", "1"]):
+        assert spread(words) == words  # which have sentences of their own
+
+
 def test_a_file_of_such_a_name_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "g=1.yaml").touch()

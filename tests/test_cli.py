@@ -82,9 +82,15 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
     [
         (["train", "missing.yaml"], ["missing.yaml", "does not exist"]),
         (["train", "."], ["is a folder"]),
+        (["train", __file__], ["test_cli.py is Python; a config is a YAML file, which names what a module has"]),
         (["train", "/dev/null"], ["/dev/null", "not a regular file"]),
         (train("learner.n_stesp=3"), ["--set learner.n_stesp=3", "did you mean 'n_steps'?"]),
         (train("budget.steps"), ["--set", "KEY=VALUE"]),
+        (train("curriculum.imports=a:b"), ["--set curriculum.imports=a:b: curriculum.imports: unknown key"]),
+        (
+            ["instances", "sample", "uniform", "--env", "a:B", "--out", "x", "--kwarg", "n=1", "--kwarg", "n=2"],
+            ["--kwarg 'n=2': n is given twice, as 1 before; leave one out"],
+        ),
         (train("curriculum.eta=-1"), ["curriculum.eta: must be a number above 0, not -1"]),
         (train("resources.workers=-1"), ["resources.workers", "-1"]),
         (train("resources.workers=4096"), ["resources.workers: 4096 rollout actors", "CPUs, at most", "4 shards"]),
@@ -445,7 +451,7 @@ def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str]
     (tmp_path / "s0/status.json").touch()
     code, _, error = run(capsys, "evaluate", tmp_path, "--instances", TEST)
     told = error.replace("\n", "")
-    assert (code, f"{tmp_path} holds no run: it has no status.json; {tmp_path}/s0 does" in told) == (1, True)
+    assert (code, f"{tmp_path} holds no run: it has no status.json; {tmp_path}/s0 does" in told) == (2, True)
     cell = tmp_path / "grid/cell"
     for seed in range(5):
         (cell / f"s{seed}").mkdir(parents=True)
@@ -454,7 +460,7 @@ def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str]
     for folder, command in itertools.product((cell, cell.parent), ("explain", "evaluate", "render")):
         code, _, error = run(capsys, command, folder)  # whatever else it lacks
         told = error.replace("\n", "")
-        assert (code, f"; 5 folders below it do, of which one is to be named: {listed}" in told) == (1, True)
+        assert (code, f"; 5 folders below it do, of which one is to be named: {listed}" in told) == (2, True)
 
 
 def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:
@@ -470,18 +476,23 @@ def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:
 def test_evaluate_without_a_run_is_an_error(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, _, error = run(capsys, "evaluate", tmp_path, "--instances", TEST)
-    assert (code, "holds no run" in error) == (1, True)
     (tmp_path / "my_run").mkdir()
     monkeypatch.chdir(tmp_path)
     more = {"evaluate": ("--instances", TEST), "explain": ("--iteration", 1), "export-sb3": (), "fork": ("--at", 1)}
     for command, options in {**more, "render": ("--out", "there")}.items():
+        code, _, error = run(capsys, command, "my_run", *options)
+        assert (code, "holds no run" in error) == (2, True)
         code, _, error = run(capsys, command, "my_rn", *options)
         assert (code, "my_rn does not exist; did you mean 'my_run'?" in error.replace("\n", "")) == (2, True)
     for command in ("report", "sync"):
         for named, said in (("my_rn", "my_rn is neither here nor"), (tmp_path / "my_rn", "my_rn does not exist")):
             code, _, error = run(capsys, command, named)
             assert (code, said in error.replace("\n", "")) == (2, True)
+        code, _, error = run(capsys, command, tmp_path / "my_run")
+        assert (code, "no run found in" in error) == (2, True)
+    (tmp_path / "my_run/config.yaml").touch()  # there was a run, of which the status is lost
+    code, _, error = run(capsys, "evaluate", "my_run", "--instances", TEST)
+    assert (code, "holds no run" in error) == (1, True)
 
 
 def test_a_run_folder_that_cannot_be_made_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import contextlib
 import errno
 import io
-import itertools
 import re
 import select
 import sys
@@ -165,12 +164,19 @@ def tell_findings(findings: Findings, checked: str) -> None:
 
 
 def spread(arguments: Sequence[str]) -> list[str]:
-    """A command's arguments, with `--set` before each of several settings behind one: `--set a=1 b=2`, as one types."""
+    """A command's arguments, with `--set` before each of several settings behind one: `--set a=1 b=2`, as one types.
+
+    Raises ConfigError for `--set a 1`, of which the option would take the first word alone.
+    """
     spread_out: list[str] = []
     option = None  # the one whose settings these are, once its first has been seen
-    for before, argument in itertools.pairwise(["", *arguments]):
+    for before, argument, after in zip(["", *arguments], arguments, [*arguments[1:], "-"], strict=False):
         if before in ("--set", "--kwarg"):
             option = before
+            bare = "=" not in argument + after and not argument.startswith("-") and not after.startswith("-")
+            if bare and not Path(after).exists():
+                meant = f"{before} {argument}={after}"
+                raise ConfigError(f"{before} {argument} {after}: write it as one word, with `=`: {meant}")
         elif not (_SETTING.match(argument) and not Path(argument).exists()):
             option = None
         elif option is not None:

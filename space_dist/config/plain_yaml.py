@@ -43,6 +43,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         if path.is_dir():
             raise ConfigError(f"{path} is a folder; a config is a YAML file")
+        if path.suffix == ".py" and path.exists():
+            raise ConfigError(f"{path} is Python; a config is a YAML file, which names what a module has: MODULE:NAME")
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path} is not a regular file")
         with path.open("rb") as file:

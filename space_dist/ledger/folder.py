@@ -97,15 +97,16 @@ class Ledger:
         return self.folder / f"instances_{split}.csv"
 
     def status(self) -> Status:
-        """Read `status.json`. Raises LedgerError if it is missing or damaged."""
+        """Read `status.json`. Raises LedgerError if it is lost or damaged, NotPlannedError where no run was begun."""
         try:
             content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
             if not self.folder.exists():
-                raise LedgerError(_absent(self.folder)) from None
-            raise LedgerError(f"{self.folder} holds no run: it has no status.json{_below(self.folder)}") from None
+                raise NotPlannedError(_absent(self.folder)) from None
+            kind = LedgerError if self.config.exists() else NotPlannedError
+            raise kind(f"{self.folder} holds no run: it has no status.json{_below(self.folder)}") from None
         except NotADirectoryError:
-            raise LedgerError(f"{self.folder} is no run's folder: {_file_in(self.folder)} is a file") from None
+            raise NotPlannedError(f"{self.folder} is no run's folder: {_file_in(self.folder)} is a file") from None
         except OSError as error:
             raise LedgerError(f"{self.status_file} cannot be read: {error.strerror}") from None
         try:
@@ -257,14 +258,14 @@ def there(path: Path) -> Path:
 def find_ledgers(paths: list[Path]) -> list[Ledger]:
     """Every run in or below `paths`, sorted by path, each once.
 
-    Raises LedgerError where there is none, NotPlannedError where there is no such path.
+    Raises NotPlannedError where there is none.
     """
     found: dict[Path, Ledger] = {}
     for path in map(there, paths):
         below = [Ledger(path)] if (path / "status.json").exists() else []
         below += [Ledger(file.parent) for file in path.rglob("status.json") if path.is_dir()]
         if not below:
-            raise LedgerError(f"no run found in {path}: no folder there has a status.json")
+            raise NotPlannedError(f"no run found in {path}: no folder there has a status.json")
         found |= {ledger.folder.resolve(): ledger for ledger in below}
     return [found[key] for key in sorted(found)]
 

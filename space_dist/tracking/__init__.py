@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from space_dist.config.sections import SINKS
 from space_dist.config.tracking_uri import settled_uri
-from space_dist.errors import LedgerError
+from space_dist.errors import LedgerError, NotPlannedError
 from space_dist.experiment.manifest import CELL_ID_DIGITS, MANIFEST, Grid
 from space_dist.ledger import Ledger, Status, there
 from space_dist.tracking.grids import GridMirror
@@ -88,7 +88,7 @@ class Found:
 def find(paths: Iterable[Path]) -> Found:
     """Every run and grid in, below and around `paths`, in order, each once; a grid stands for all its runs.
 
-    Raises LedgerError for a path without any, NotPlannedError for one that is not there.
+    Raises NotPlannedError for a path without any.
     """
     ledgers: dict[Path, Ledger] = {}
     grids: dict[Path, Grid] = {}
@@ -109,7 +109,7 @@ def find(paths: Iterable[Path]) -> Found:
                 else:
                     ledgers[where] = Ledger(folder)
         if not hit and len(ledgers) + len(grids) == before:
-            raise LedgerError(
+            raise NotPlannedError(
                 f"no run or grid found in {path}: no folder there has a {_STATUS}, or a {MANIFEST} beside instances"
             )
     return Found(tuple(ledgers[key] for key in sorted(ledgers)), tuple(grids[key] for key in sorted(grids)))
