@@ -325,7 +325,7 @@ def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
     status = Ledger(folder).status()
     assert (code, status.state) == (75, "interrupted"), said
     assert 0 < status.steps < 4096
-    assert "--resume continues" in said
+    assert f"after {status.steps:,} steps; the same command with --resume goes on" in said
     code, _, _ = run(capsys, *train(out=folder), "--resume")
     assert code == 0
     assert same(folder, finished)
@@ -627,7 +627,7 @@ def test_progress_shows_the_last_evaluation_at_the_end_and_after_resuming(
     assert said.splitlines()[-2].endswith(returns(-1))
     _, said, _ = run(capsys, *command, "--set", "budget.steps=8192", "--resume")
     begun, first, *_, last, _ = [line for line in said.splitlines() if " steps" in line]
-    assert begun == "pointmass_space s0: going on at 3,840 steps, under a larger budget"
+    assert begun == "pointmass_space s0: going on at 3,840 steps, under a larger budget: 4,096 -> 8,192 steps"
     assert returns(0) in first  # a larger budget goes on from the round before the last, and the last evaluation
     assert last.endswith(returns(-1))
     assert len({returns(0), returns(1), returns(2)}) == 3
@@ -646,9 +646,12 @@ def test_what_is_left_of_a_budget_and_where_a_run_goes_on_is_said(
     _, said, _ = run(capsys, *short)
     assert said == f"pointmass_space, seed 0: was already done, {left_over}"
     _, said, _ = run(capsys, *command, "--set", "budget.steps=700")
-    why = "there is no checkpoint from before the end of the smaller one"
-    assert f"pointmass_space s0: beginning anew, under a larger budget: {why}\n" in said
-    assert f"beginning anew, under a larger budget: {why}" in (tmp_path / "run/log.txt").read_text()
+    why = (
+        "beginning anew, under a larger budget: 600 -> 700 steps; no checkpoint is from before the end of the smaller "
+        "one, so it repeats it from its start, to the same bits, and goes beyond"
+    )
+    assert f"pointmass_space s0: {why}\n" in said
+    assert why in (tmp_path / "run/log.txt").read_text()
 
 
 def test_cells_never_look_alike_however_narrow_the_terminal(

@@ -26,7 +26,7 @@ from space_dist.api import progress
 from space_dist.api.arguments import as_changes
 from space_dist.api.training import as_config
 from space_dist.config import Mirrors, RunConfig
-from space_dist.errors import ConfigError, LedgerError
+from space_dist.errors import ConfigError, LedgerError, SpaceDistError
 from space_dist.grid.planning import plan
 from space_dist.grid.tuning import plan_search
 from space_dist.ledger import CURRICULUM, METRICS, RunWriter
@@ -113,6 +113,70 @@ def test_without_its_checkpoints_a_run_gets_no_larger_budget(tmp_path: Path) -> 
         space_dist.train(long, out=run.folder, resume=True, progress=False)
     assert files(run.folder) == before
     assert run.status.state == "done"
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    """All of a run's files but its lock, which whoever looks at a run takes."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != "lock.json"
+    }
+
+
+@pytest.mark.parametrize("state", ["done", "interrupted"])
+@pytest.mark.parametrize("grows", [True, False])
+@pytest.mark.parametrize("damaged", ["all", "the one that is needed", "rows under both", "all, and the status gone"])
+def test_what_cannot_go_on_is_left_as_it_is(damaged: str, grows: bool, state: str, tmp_path: Path) -> None:
+    config = config_for(tmp_path, learner_section("ppo"), checkpoint={"every_rounds": 1})
+
+    def give_up(now: Progress) -> None:
+        if state == "interrupted" and now.steps >= 4 * N_STEPS:
+            raise KeyboardInterrupt
+
+    with contextlib.suppress(KeyboardInterrupt):
+        space_dist.train(config, out=tmp_path / "run", progress=give_up)
+    run = tmp_path / "run"
+    assert space_dist.Run(run).status.state == state
+    newest, older = sorted((run / "checkpoints").iterdir(), reverse=True)
+    if damaged == "rows under both":
+        (run / METRICS).write_bytes(b"!" + (run / METRICS).read_bytes()[1:])
+    for path in {"the one that is needed": [older], "rows under both": []}.get(damaged, [newest, older]):
+        path.write_bytes(path.read_bytes()[:-100])
+    if damaged.endswith("gone"):
+        (run / "status.json").unlink()
+    longer = config_for(tmp_path, learner_section("ppo"), checkpoint={"every_rounds": 1}, budget={"steps": 480})
+    before = everything(run)
+    # Of a done run, the last checkpoint is from its end: a longer one needs that before it.
+    goes_on = damaged == "the one that is needed" and not (grows and state == "done")
+    stays_done = state == "done" and not grows and damaged == "all"
+    with contextlib.nullcontext() if goes_on or stays_done else pytest.raises(SpaceDistError) as refused:
+        space_dist.train(longer if grows else config, out=run, resume=True, progress=False)
+    if goes_on:
+        assert space_dist.Run(run).status.state == "done"
+        return
+    assert everything(run) == before
+    if refused is not None and "gone" not in damaged:
+        assert re.search(r"no checkpoint( that it could go on from)? is intact \(", str(refused.value))
+
+
+def test_killed_as_it_forgets_the_only_checkpoint_it_begins_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section, seldom = learner_section("ppo"), {"every_rounds": 1000, "every_seconds": 1e6}
+    space_dist.train(config_for(tmp_path, section, checkpoint=seldom), out=tmp_path / "run", progress=False)
+    long = config_for(tmp_path, section, checkpoint=seldom, budget={"steps": 8 * N_STEPS})
+
+    def die(path: Path, **options: bool) -> None:  # noqa: ARG001 - the signature is pathlib's
+        raise KeyboardInterrupt if path.suffix == ".npz" else FileNotFoundError
+
+    monkeypatch.setattr(Path, "unlink", die)
+    with pytest.raises(KeyboardInterrupt):
+        space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    monkeypatch.undo()
+    space_dist.train(long, out=tmp_path / "run", resume=True, progress=False)
+    space_dist.train(long, out=tmp_path / "whole", progress=False)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
 
 
 def test_a_longer_run_that_is_interrupted_goes_on(tmp_path: Path) -> None:

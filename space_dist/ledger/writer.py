@@ -37,6 +37,17 @@ log = logging.getLogger("space_dist")
 KEPT_CHECKPOINTS = 2  # one more than is needed: the newest may turn out to be damaged
 
 
+@dataclasses.dataclass(frozen=True)
+class _Restorable:
+    """A checkpoint that fits what is there: what it holds, the rows under it, and why newer ones do not."""
+
+    file: Path
+    content: bytes
+    checkpoint: Checkpoint
+    prefixes: dict[str, bytes]
+    reasons: list[str]
+
+
 class RunWriter:
     """The owner's side of a ledger: holds the lock, appends rows, commits checkpoints.
 
@@ -143,40 +154,74 @@ class RunWriter:
                 file.unlink()
         return status
 
+    def refuse_unrestorable(
+        self, keep: Callable[[Checkpoint], bool] = lambda checkpoint: True, also: str | None = None
+    ) -> None:
+        """Raise what `restore` would raise, while nothing is written yet.
+
+        keep, also: before `hand_over`, what it is given, and the identity that it gives: interrupted, it may have given
+        that to some.
+        """
+        self._restorable(keep, also)
+
     def restore(self) -> Checkpoint | None:
         """Cut every row file back to the newest intact checkpoint and return it; to nothing where none was written.
 
         Raises LedgerError, and changes nothing, if something cannot be read that may be intact, and UnreadableError if
         there are checkpoints but none fits what is there, or if the status names one but there is none.
         """
+        found = self._restorable()
+        files = self.ledger.checkpoint_files()
+        if found is None:
+            with _clear_errors(self.ledger.folder), self._lock.held():
+                self._cut(dict.fromkeys(ROW_FILES, b""))
+                for forgotten in files:
+                    forgotten.unlink()
+            return None
+        if found.reasons:
+            reasons = "; ".join(found.reasons)
+            log.warning("going back to the checkpoint of round %d (%s)", found.checkpoint.round, reasons)
+        with _clear_errors(self.ledger.folder), self._lock.held():
+            # In this order: a kill in between leaves a status whose checkpoint and rows are there.
+            self._point_at(found.file.name, found.content, found.checkpoint)
+            self._cut(found.prefixes)
+            for newer in files[: files.index(found.file)]:
+                newer.unlink()
+        return found.checkpoint
+
+    def _restorable(
+        self, keep: Callable[[Checkpoint], bool] = lambda checkpoint: True, also: str | None = None
+    ) -> _Restorable | None:
+        """The newest intact checkpoint that `keep` keeps; None where none was written. Raises as `restore` does."""
         files = self.ledger.checkpoint_files()
         named = None if self.status is None else self.status.checkpoint
         reasons = [f"{named}: missing"] if named is not None and (not files or files[0].name < named) else []
+        needed = "no checkpoint"
         for file in files:
             try:
                 content = self._intact_or_refused(file)
                 checkpoint = decode_checkpoint(content)
-                prefixes = self._verified_prefixes(checkpoint)
+                if not keep(checkpoint) or self._is_forgotten(checkpoint):
+                    needed = "no checkpoint that it could go on from"
+                    continue
+                prefixes = self._verified_prefixes(checkpoint, also)
             except ValueError as error:
                 reasons.append(f"{file.name}: {error}")
                 continue
-            if reasons:
-                log.warning("going back to the checkpoint of round %d (%s)", checkpoint.round, "; ".join(reasons))
-            with _clear_errors(self.ledger.folder), self._lock.held():
-                # In this order: a kill in between leaves a status whose checkpoint and rows are there.
-                self._point_at(file.name, content, checkpoint)
-                self._cut(prefixes)
-                for newer in files[: files.index(file)]:
-                    newer.unlink()
-            return checkpoint
+            return _Restorable(file, content, checkpoint, prefixes, reasons)
         if reasons:
             raise UnreadableError(
-                f"{self.ledger.folder} cannot be resumed: no checkpoint is intact ({'; '.join(reasons)}). "
+                f"{self.ledger.folder} cannot be resumed: {needed} is intact ({'; '.join(reasons)}). "
                 "Nothing was changed; start the run in another folder"
             )
-        with _clear_errors(self.ledger.folder), self._lock.held():
-            self._cut(dict.fromkeys(ROW_FILES, b""))
         return None
+
+    def _is_forgotten(self, checkpoint: Checkpoint) -> bool:
+        """Whether it is what a `hand_over` that kept none, and was then interrupted, had not removed yet."""
+        theirs = checkpoint.data.get("about", {}).get("identity")
+        if self.status is None or self.status.checkpoint is not None:
+            return False
+        return self.status.round == 0 and None not in (theirs, self.status.identity) and theirs != self.status.identity
 
     def _intact_or_refused(self, path: Path) -> bytes:
         """A file's content. Raises ValueError if it is gone, LedgerError if it may be intact but cannot be read now."""
@@ -202,10 +247,10 @@ class RunWriter:
             )
         )  # fmt: skip
 
-    def _verified_prefixes(self, checkpoint: Checkpoint) -> dict[str, bytes]:
+    def _verified_prefixes(self, checkpoint: Checkpoint, also: str | None = None) -> dict[str, bytes]:
         theirs = checkpoint.data.get("about", {}).get("identity")
         ours = None if self.status is None else self.status.identity
-        if theirs != ours and None not in (theirs, ours):
+        if theirs not in (ours, also) and None not in (theirs, ours):
             raise ValueError("it belongs to a run of another configuration")
         for segment in checkpoint.segments:
             content = self._intact_or_refused(self._segment_path(segment))

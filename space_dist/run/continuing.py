@@ -29,10 +29,33 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
     reason = _goes_by_budget(before)
     if reason is not None:
         raise ConfigError(
-            f"budget: {old.steps:,} -> {new.steps:,} steps: {reason}, so a longer run is another from its start: "
-            "use --out DIR for it (from Python: out=DIR). With `init_from` it starts from this run's policy"
+            f"budget: {_grown(before, now)}: {reason}, so a longer run is another from its start: use --out DIR for "
+            "it (from Python: out=DIR). With `init_from` it starts from this run's policy. Under the budget that it "
+            "has, this one goes on"
         )
     return True
+
+
+def _grown(before: RunConfig, now: RunConfig) -> str:
+    """`40,960 -> 81,920 steps`, and the same of episodes, of what has another limit."""
+    old, new = before.budget, now.budget
+    steps = [] if old.steps == new.steps else [f"{old.steps:,} -> {new.steps:,} steps"]
+    if old.episodes == new.episodes:
+        return "".join(steps)
+    first, second = (f"{limit:,}" if limit is not None else "no limit" for limit in (old.episodes, new.episodes))
+    return ", ".join([*steps, f"{first} -> {second} episodes"])
+
+
+def longer_in_words(before: RunConfig, now: RunConfig, status: Status, *, same_bits: bool) -> str:
+    """Where a run goes on that was `before` and was handed over to `now`: `status`, as `hand_over` returned it."""
+    if before.budget == now.budget:
+        return f"going on at {status.steps:,} steps, under another schedule"
+    under = f"under a larger budget: {_grown(before, now)}"
+    if status.checkpoint is not None:
+        return f"going on at {status.steps:,} steps, {under}"
+    repeats = "repeats it from its start, to the same bits," if same_bits else "repeats it from its start"
+    why = "no checkpoint is from before the end of the smaller one"
+    return f"beginning anew, {under}; {why}, so it {repeats} and goes beyond"
 
 
 def takes_over(before: RunConfig, now: RunConfig, status: Status | None) -> bool:

@@ -53,7 +53,7 @@ from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
 from space_dist.run.cluster import Cluster, InProcess, n_workers
-from space_dist.run.continuing import is_longer, takes_over, within
+from space_dist.run.continuing import is_longer, longer_in_words, takes_over, within
 from space_dist.run.training import Progress, Training
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile, in_words
@@ -277,32 +277,25 @@ def _claim(
         started_at=now, updated_at=now, fingerprint=here,
         identity=configs.identity(config, setup.train.digest(), setup.test.digest(), given=given),
     )  # fmt: skip
-    before, earlier, goes_on = None, None, ""
+    before, earlier, goes_on, damage = None, None, "", list[str]()
     if not _is_stillborn(ledger):
         before = writer.status = _status_before(ledger)
         earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
     if before is not None:
-        if earlier is not None and before.checkpoint is not None and not ledger.checkpoint_files():
-            raise ConfigError(
-                f"{ledger.folder}: its checkpoints were removed, and a larger budget goes on from one of them: use "
-                "--out DIR (from Python: out=DIR) for another run. With `init_from` it starts from this one's policy"
-            )
         if before.has_reached(pause_at) and earlier is None:
             damage = ledger.damage() or _damage_behind(ledger)
             if not damage:
                 return before, ""
         else:
             damage = _damaged_checkpoint(ledger)
+    # A run that cannot go on stays as it is: above all one that is done, and was asked for a larger budget.
+    kept = within(earlier, blueprint.spec.horizon) if earlier is not None else lambda checkpoint: True
+    _refuse_unusable_checkpoints(ledger, before, longer=earlier is not None)
+    writer.refuse_unrestorable(kept, status.identity)
+    if before is not None:
         # Here, where no log is open yet, they are said on standard error.
         for sentence in damage:
             log.warning("%s; computing it again from the last checkpoint that is intact", sentence)
-        if before.checkpoint is not None and before.format != FORMAT:
-            raise ConfigError(
-                f"{ledger.folder} was begun by an earlier version of space_dist (format {before.format} of its files; "
-                f"this version writes {FORMAT}), whose checkpoints, up to commit 2f6e945, lack the episodes in "
-                "progress: it can be evaluated and reported on, and not gone on with. Use another folder, or the "
-                "version that began it"
-            )
         changed = before.checkpoint is not None and dict(before.fingerprint) != here
         if not damage:
             goes_on = _where_it_goes_on(ledger, before)
@@ -314,18 +307,33 @@ def _claim(
         )  # fmt: skip
     stored = configs.dump(_self_contained(config))
     if earlier is not None:
-        now_at = writer.hand_over(status, stored, within(earlier, blueprint.spec.horizon))
+        now_at = writer.hand_over(status, stored, kept)
         status = replace(status, steps=now_at.steps, round=now_at.round)
-        what = "another schedule" if earlier.budget == config.budget else "a larger budget"
-        goes_on = f"going on at {status.steps:,} steps, under {what}"
-        if now_at.checkpoint is None:
-            goes_on = f"beginning anew, under {what}: there is no checkpoint from before the end of the smaller one"
+        goes_on = longer_in_words(earlier, config, now_at, same_bits=not status.fingerprint_changed)
     # Before the status, which names the digests of these files.
     writer.write_config(stored, setup.train.to_csv(), setup.test.to_csv(), given)
     if stop.sweep(ledger.stop_file):
         log.warning("%s is from before this began: it asked somebody else, and was removed", ledger.stop_file)
     writer.set_status(status)
     return status, goes_on
+
+
+def _refuse_unusable_checkpoints(ledger: Ledger, before: Status | None, *, longer: bool) -> None:
+    """Raise ConfigError if a run's checkpoints were removed and it is to be longer, or are of another format."""
+    if before is None or before.checkpoint is None:
+        return
+    if longer and not ledger.checkpoint_files():
+        raise ConfigError(
+            f"{ledger.folder}: its checkpoints were removed, and a larger budget goes on from one of them: use "
+            "--out DIR (from Python: out=DIR) for another run. With `init_from` it starts from this one's policy"
+        )
+    if before.format != FORMAT:
+        raise ConfigError(
+            f"{ledger.folder} was begun by an earlier version of space_dist (format {before.format} of its files; "
+            f"this version writes {FORMAT}), whose checkpoints, up to commit 2f6e945, lack the episodes in "
+            "progress: it can be evaluated and reported on, and not gone on with. Use another folder, or the "
+            "version that began it"
+        )
 
 
 def _where_it_goes_on(ledger: Ledger, before: Status) -> str:

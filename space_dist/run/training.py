@@ -538,7 +538,7 @@ class Training:
         reason = self._stop_requested()
         if reason is not None:
             yield from self._commit("interrupted", reason)
-            raise Interrupted(f"stopped by {reason} after {self._run.steps} steps; {CONTINUES}")
+            raise Interrupted(f"stopped by {reason} after {self._run.steps:,} steps; {CONTINUES}")
         rounds, seconds = self._run.round - self._last_commit_round, time.monotonic() - self._last_commit_time
         if self._config.checkpoint.is_due(rounds, seconds, self._commit_cost):
             yield from self._commit("running")
