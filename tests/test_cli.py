@@ -26,6 +26,7 @@ from space_dist.config import RunConfig, reading
 from space_dist.experiment.manifest import Cell, Grid, Run
 from space_dist.grid.conductor import Overview
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, encode_row
+from space_dist.run.training import Progress
 from space_dist.slurm.profile import Profile
 from space_dist.system.interrupts import StopRequests
 from tests import prepared
@@ -461,6 +462,13 @@ def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str]
         code, _, error = run(capsys, command, folder)  # whatever else it lacks
         told = error.replace("\n", "")
         assert (code, f"; 5 folders below it do, of which one is to be named: {listed}" in told) == (2, True)
+    (cell.parent / "alone").mkdir()
+    (cell.parent / "alone/status.json").touch()
+    code, _, error = run(capsys, "explain", cell.parent)
+    assert f"; 6 folders below it do, of which one is to be named: {cell.parent}/alone, " in error.replace("\n", "")
+    code, _, error = run(capsys, "evaluate", CONFIG, "--instances", TEST)
+    assert code == 2
+    assert f"{Path(CONFIG).absolute()} is no run's folder: it is a file" in error.replace("\n", "")
 
 
 def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:
@@ -631,6 +639,20 @@ def test_progress_shows_the_last_evaluation_at_the_end_and_after_resuming(
     assert returns(0) in first  # a larger budget goes on from the round before the last, and the last evaluation
     assert last.endswith(returns(-1))
     assert len({returns(0), returns(1), returns(2)}) == 3
+
+
+@pytest.mark.parametrize(("width", "line"), [
+    (None, "491,520/1,000,000 steps  12,097/s  1:04:23 left  set 33/100  return train -7.56 test 18.11"),
+    (80, "491,520/1,000,000 steps  12,097/s  1:04:23 left  return train -7.56 test 18.11"),
+    (61, "491,520/1,000,000  12,097/s  1:04:23  train -7.56 test 18.11"),  # of 80, behind `pointmass_space s0`
+    (55, "491,520/1,000,000  1:04:23 left  train -7.56 test 18.11"),
+    (9, "491,520/1,000,000  1:04:23 left  train -7.56 test 18.11"),
+])  # fmt: skip
+def test_a_narrow_terminal_shows_the_returns(width: int | None, line: str) -> None:
+    progress = Progress(
+        491_520, 1_000_000, 12_097.0, 33, 100, train_return=-7.56, test_return=18.11, seconds_left=3863.0
+    )  # fmt: skip
+    assert runs.in_words(progress, width) == line
 
 
 def test_what_is_left_of_a_budget_and_where_a_run_goes_on_is_said(

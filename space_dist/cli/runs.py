@@ -29,6 +29,8 @@ _REPORT_WIDTH = 200  # characters
 _GRID_WIDTH = 150
 _MAX_CELLS_SHOWN = 60
 _MAX_NAMED = 5  # folders in a line
+_BAR_WIDTH = 20
+_LINE_WIDTH = 100  # beside a bar
 _LINE_SECONDS = 10.0  # between lines of progress
 
 
@@ -386,17 +388,20 @@ def _display(name: str, seed: int) -> Iterator[tuple[Callable[[Progress], None],
         return
     from rich import progress as rich_progress
 
+    title = f"{name} s{seed}"
+    wide = console.width >= len(title) + _BAR_WIDTH + _LINE_WIDTH
     bar = rich_progress.Progress(
         rich_progress.TextColumn("[bold]{task.description}"),
-        rich_progress.BarColumn(),
+        *([rich_progress.BarColumn(_BAR_WIDTH)] if wide else []),
         rich_progress.TextColumn("{task.fields[line]}"),
         console=console,
     )
     with bar:
-        task = bar.add_task(f"{name} s{seed}", total=None, line="reading instances and environment")
+        task = bar.add_task(title, total=None, line="reading instances and environment")
 
         def observe(progress: Progress) -> None:
-            bar.update(task, completed=progress.share, total=1.0, line=_in_words(progress))
+            line = in_words(progress, console.width - len(title) - 1)
+            bar.update(task, completed=progress.share, total=1.0, line=line)
 
         yield observe, lambda what: bar.update(task, line=what)
 
@@ -411,21 +416,31 @@ def _lines(title: str) -> tuple[Callable[[Progress], None], Callable[[str], None
         if now - said_at < _LINE_SECONDS and progress.share < 1:
             return
         said_at = now
-        say(f"{title}: {_in_words(progress)}")
+        say(f"{title}: {in_words(progress)}")
 
     return observe, lambda what: say(f"{title}: {what}")
 
 
-def _in_words(progress: Progress) -> str:
-    """How far a run is; what a narrow terminal may cut off, where a bar is shown as well, comes last."""
+def in_words(progress: Progress, width: int | None = None) -> str:
+    """How far a run is, in so many characters if that can be: what matters least is left out, first of all."""
 
     def number(value: float | None) -> str:
         return "—" if value is None else f"{value:.2f}"
 
     seconds = progress.seconds_left
-    left = "" if seconds is None else f"{datetime.timedelta(seconds=round(seconds))} left  "
-    return (
-        f"{progress.so_far}  {progress.pace}  {left}"
-        f"set {progress.trained}  "
-        f"return train {number(progress.train_return)} test {number(progress.test_return)}"
+    left = "" if seconds is None else f"{datetime.timedelta(seconds=round(seconds))} left"
+    returns = f"train {number(progress.train_return)} test {number(progress.test_return)}"
+    done, steps = [progress.so_far, progress.pace, left], progress.so_far.removesuffix(" steps")
+    lines = (
+        [*done, f"set {progress.trained}", f"return {returns}"],
+        [*done, f"return {returns}"],
+        [*done, returns],
+        [steps, progress.pace, left, returns],
+        [steps, progress.pace, left.removesuffix(" left"), returns],
+        [steps, left or progress.pace, returns],
     )
+    for parts in lines:
+        line = "  ".join(filter(None, parts))
+        if width is None or len(line) <= width:
+            break
+    return line

@@ -100,7 +100,9 @@ def _told_at_once(sentence: str) -> None:
     """To standard error, from within a signal's handler: nothing that is buffered may be touched, nor may it wait."""
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
-            os.write(2, f"space-dist: {sentence}\n".encode())
+            # A progress bar hides the cursor, and what ends at once does not get to show it again.
+            cursor = "\x1b[?25h" if os.isatty(2) else ""
+            os.write(2, f"{cursor}space-dist: {sentence}\n".encode())
 
 
 STOP = StopRequests(tell=_told_at_once)

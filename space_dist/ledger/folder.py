@@ -240,7 +240,7 @@ def _file_in(path: Path) -> str:
 
 def _below(folder: Path) -> str:
     """Which runs to name instead of a folder that holds none itself: its own, or, of a grid, those of its cells."""
-    found = sorted(folder.glob("*/status.json")) or sorted(folder.glob("*/*/status.json"))
+    found = sorted([*folder.glob("*/status.json"), *folder.glob("*/*/status.json")])
     if len(found) < 2:
         return "".join(f"; {file.parent} does" for file in found)
     named = ", ".join(str(file.parent) for file in found[:_SHOWN])

@@ -128,10 +128,14 @@ class StopRequests:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - the signature is Python's
         if self._reason is not None:
             if number == signal.SIGINT:
+                where = "" if self._instead else ", on the last checkpoint that there is"
+                self._tell(f"SIGINT again: ended at once{where} (exit code {Interrupted.exit_code})")
                 os._exit(Interrupted.exit_code)
             return
         self._reason = signal.Signals(number).name
         ending = self._instead or f"ending with a checkpoint, which takes up to {self._grace_seconds:g} s"
+        if number == signal.SIGINT and not self._instead:
+            ending += "; another Ctrl-C ends at once, without it"
         self._tell(f"{self._reason}: {ending}")
         timer = threading.Timer(self._grace_seconds, self._give_up)
         timer.daemon = True

@@ -111,6 +111,29 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
     assert results(tmp_path / "run") == results(tmp_path / "reference")
 
 
+def test_a_second_ctrl_c_ends_at_once_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = tmp_path / "said.txt"
+    monkeypatch.setenv(PAUSE, "5")
+    process = prepared.command(command(tmp_path, env="tests.faults.slow_env:make"), said)
+    monkeypatch.delenv(PAUSE)
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not (tmp_path / "run" / "log.txt").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        send(process, signal.SIGINT)
+        while "another Ctrl-C" not in said.read_text() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        send(process, signal.SIGINT)
+        process.join(PATIENCE)
+    finally:
+        process.kill()
+    assert process.exitcode == 75, said.read_text()
+    assert re.findall(r"^space-dist: (.*)$", said.read_text(), re.MULTILINE) == [
+        "SIGINT: ending with a checkpoint, which takes up to 25 s; another Ctrl-C ends at once, without it",
+        "SIGINT again: ended at once, on the last checkpoint that there is (exit code 75)",
+    ]
+
+
 @pytest.mark.ray
 @pytest.mark.parametrize("progress", [0.0, 0.5, 1.0, None])
 def test_sigterm_while_ray_starts_ends_with_75(tmp_path: Path, progress: float | None) -> None:
