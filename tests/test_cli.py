@@ -14,6 +14,7 @@ import threading
 import time
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -22,10 +23,11 @@ from hypothesis import strategies as st
 
 from space_dist import cli
 from space_dist.cli import overview, runs, terminal
-from space_dist.config import RunConfig, reading
+from space_dist.config import BudgetConfig, RunConfig, reading
 from space_dist.experiment.manifest import Cell, Grid, Run
 from space_dist.grid.conductor import Overview
 from space_dist.ledger import CURRICULUM, METRICS, Ledger, encode_row
+from space_dist.run.launch import Outcome
 from space_dist.run.training import Progress
 from space_dist.slurm.profile import Profile
 from space_dist.system.interrupts import StopRequests
@@ -471,6 +473,19 @@ def test_a_folder_of_seeds_is_told_from_a_run(capsys: pytest.CaptureFixture[str]
     assert f"{Path(CONFIG).absolute()} is no run's folder: it is a file" in error.replace("\n", "")
 
 
+def test_a_run_of_another_configuration_is_told_by_its_kind(capsys: pytest.CaptureFixture[str], finished: Path) -> None:
+    command = [*train(out=finished), "--set", "curriculum={kind: round_robin}"]
+    code, _, error = run(capsys, *command)
+    told = error.replace("\n", "")
+    assert code == 2
+    assert f"{finished} already holds a run of another configuration: --out DIR starts another (from Python: " in told
+    code, _, error = run(capsys, *command, "--resume")
+    assert code == 2
+    assert "of another configuration (curriculum.kind: space -> round_robin). A run's" in error.replace("\n", "")
+    code, _, error = run(capsys, *train(out=finished))
+    assert "already holds a run: --resume continues it, --out DIR" in error.replace("\n", "")
+
+
 def test_a_current_folder_that_was_removed_is_told(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
@@ -653,6 +668,14 @@ def test_a_narrow_terminal_shows_the_returns(width: int | None, line: str) -> No
         491_520, 1_000_000, 12_097.0, 33, 100, train_return=-7.56, test_return=18.11, seconds_left=3863.0
     )  # fmt: skip
     assert runs.in_words(progress, width) == line
+
+
+def test_episodes_beyond_the_budget_are_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    ledger = Ledger(Path("run"))
+    monkeypatch.setattr(Ledger, "status", lambda _: SimpleNamespace(steps=6144))
+    monkeypatch.setattr(Ledger, "episodes", lambda _: 32)
+    told = runs._taken(Outcome(ledger), BudgetConfig(steps=20_000, episodes=20))
+    assert told == "32 episodes (the round in which episode 20 ended was finished), 6,144 environment steps"
 
 
 def test_what_is_left_of_a_budget_and_where_a_run_goes_on_is_said(

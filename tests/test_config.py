@@ -489,6 +489,11 @@ def test_missing_sections_are_told_what_they_need(tmp_path: Path) -> None:
     assert "curriculum: this key is required: a section with a kind, like `kind: space`; `space-dist config" in text
     assert "explains it. Allowed: space, round_robin" in text
     assert "instances: this key is required: a section with train and test; `space-dist config" in text
+    tree = plain(SPACE) | {"budget": {"episodes": 40}}
+    assert refusal(written(tmp_path, json.dumps(tree))).endswith(
+        "budget.steps: this key is required: budget.episodes is a limit beside it, and the one that is reached first "
+        "ends a run; `space-dist config schema budget.steps` explains it"
+    )
 
 
 def test_what_somebody_elses_code_takes_is_said_to_stand_in_kwargs() -> None:

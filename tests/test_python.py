@@ -25,11 +25,12 @@ from space_dist import config as configs
 from space_dist.api import progress
 from space_dist.api.arguments import as_changes
 from space_dist.api.training import as_config
-from space_dist.config import Mirrors, RunConfig
+from space_dist.config import BudgetConfig, Mirrors, RunConfig
 from space_dist.errors import ConfigError, LedgerError, SpaceDistError
 from space_dist.grid.planning import plan
 from space_dist.grid.tuning import plan_search
 from space_dist.ledger import CURRICULUM, METRICS, RunWriter
+from space_dist.run.continuing import is_longer
 from space_dist.run.pace import TimeLeft
 from space_dist.run.training import Progress
 from space_dist.tracking.pusher import Pusher
@@ -234,6 +235,15 @@ def test_what_goes_by_the_budget_is_not_made_longer(
             config_for(tmp_path, section, budget={"steps": 8 * N_STEPS}), out=tmp_path / "run", resume=True
         )
     assert files(tmp_path / "run") == before
+
+
+def test_a_refused_budget_names_the_limit_that_grew(tmp_path: Path) -> None:
+    short = config_for(tmp_path, learner_section("ppo", learning_rate_schedule="linear"))
+    budgets = [short.model_copy(update={"budget": BudgetConfig(steps=9, episodes=limit)}) for limit in (1, 60)]
+    with pytest.raises(
+        ConfigError, match=r"budget: 1 -> 60 episodes: .* Under the budget that it has, this one goes on"
+    ):
+        is_longer(*budgets)
 
 
 @pytest.mark.parametrize("kind", ["ppo", "recurrent_ppo", "td3"])

@@ -13,7 +13,7 @@ import pytest
 
 from space_dist import config as configs
 from space_dist.errors import ConfigError, SpaceDistError
-from space_dist.ledger import Ledger
+from space_dist.ledger import Ledger, encode_row
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.sb3.export import export_sb3
@@ -178,7 +178,20 @@ def test_arguments_that_its_class_does_not_take_are_refused_by_check_and_run_ali
     assert not (example / "run").exists()
 
 
-def test_a_run_that_failed_before_its_first_round_holds_nobody_up(
+def test_a_fault_in_its_update_is_told_with_where_and_holds_nobody_up(example: Path) -> None:
+    (example / "own_fault.py").write_text(
+        "from stable_baselines3 import PPO\nclass Mine(PPO):\n    def train(self):\n        {}['a']\n"
+    )
+    run = example / "run"
+    failing = chosen("learner.import=own_fault:Mine", "learner.kwargs={}")
+    with pytest.raises(SpaceDistError, match=r"failed: KeyError: 'a' \(own_fault.py, line 4, in train\)\. The "):
+        launch(failing, run, resume=False, stop=StopRequests())
+    assert (run / "metrics.jsonl").read_bytes()
+    launch(chosen(), run, resume=False, stop=StopRequests())
+    assert results(run) == trained(example / "alone")
+
+
+def test_a_run_that_failed_before_its_first_iteration_holds_nobody_up(
     example: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As by a class that cannot be made on that machine: nothing is lost if another config takes its folder."""
@@ -189,7 +202,7 @@ def test_a_run_that_failed_before_its_first_round_holds_nobody_up(
         with pytest.raises(SpaceDistError, match="cannot be made of"):
             launch(chosen("learner.kwargs={targte: 3.0}"), run, resume=False, stop=StopRequests())
     assert Ledger(run).status().state == "failed"
-    (run / "metrics.jsonl").touch()  # as of one that failed later
+    (run / "metrics.jsonl").write_bytes(encode_row({"kind": "iteration"}))  # as of one that failed later
     with pytest.raises(SpaceDistError, match="already holds a run"):
         launch(right, run, resume=False, stop=StopRequests())
     (run / "metrics.jsonl").unlink()

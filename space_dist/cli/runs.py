@@ -80,6 +80,8 @@ def _taken(outcome: Outcome, budget: BudgetConfig) -> str:
     if budget.episodes is not None:
         episodes = outcome.ledger.episodes()
         ended, enough = f"{episodes:,} of {budget.episodes:,} episodes, ", episodes >= budget.episodes
+        if episodes > budget.episodes:  # rounds are whole
+            ended = f"{episodes:,} episodes (the round in which episode {budget.episodes:,} ended was finished), "
     if enough or steps >= budget.steps:
         return f"{ended}{steps:,} environment steps"
     return f"{ended}{steps:,} of {budget.steps:,} environment steps: another update takes {outcome.next_round}"

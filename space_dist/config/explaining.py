@@ -137,11 +137,13 @@ def explain(
     if kind == "missing" and isinstance(fault["loc"][-1], int):  # of a list of so many
         return explain({**fault, "type": "too_short", "loc": fault["loc"][:-1]}, root, source, origins, data)
     if kind == "missing":
-        way_out = f"; `space-dist config schema {path[-1]}` explains it" if root is RunConfig else ""
+        way_out = f"; `space-dist config schema {key}` explains it" if root is RunConfig else ""
         if root is not RunConfig and keyword.iskeyword(path[-1]):  # the key is an argument, and Python's own word
             way_out = f"; as an argument it is written **{{{path[-1]!r}: ...}}"
         needed = f": a section with {needs}" if (needs := _needs(options)) else ""
-        return f"{where}: {key}: this key is required{_BESIDE.get(key, '')}{needed}{way_out}{_allowed_kinds(options)}"
+        if key == "budget.steps" and isinstance(given, Mapping) and "episodes" in given:
+            needed = ": budget.episodes is a limit beside it, and the one that is reached first ends a run"
+        return f"{where}: {key}: this key is required{needed}{way_out}{_allowed_kinds(options)}"
     if kind in ("model_type", "model_attributes_type"):
         # An item of a list, or what a user's own name stands for, is no field: then the model is its own.
         named = [one for one in (*options, model) if one and one.__name__ == context.get("class_name")]

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import sys
+import sysconfig
 import time
 import traceback
 import zipfile
@@ -42,7 +43,6 @@ from space_dist.ledger import (
     FORMAT,
     GIVEN,
     GOES_BACK,
-    METRICS,
     Ledger,
     RunWriter,
     State,
@@ -65,6 +65,7 @@ from space_dist.tracking.settling import settled
 
 log = logging.getLogger("space_dist")
 
+_PACKAGE = Path(__file__).parents[1]
 _FINAL_PUSH_SECONDS = 45.0  # for all of it: a server that answers badly (20 s a request), the last rows, the pictures
 
 
@@ -225,10 +226,7 @@ def _begun(
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
     if ledger.exists() and not resume and not _is_stillborn(ledger):
-        raise ConfigError(
-            f"{folder} already holds a run: --resume continues it, --out DIR starts another (from Python: resume=True, "
-            "out=DIR)"
-        )
+        raise ConfigError(f"{folder} already holds a run{_ways_out(config, ledger)}")
     with RunWriter(ledger) as writer:
         status, goes_on = _claim(blueprint, setup, writer, stop, pause_at)
         done = Outcome(ledger, already_done=status.has_reached(pause_at), next_round=blueprint.round_in_words)
@@ -399,14 +397,14 @@ def arithmetic_digest() -> str:
 
 
 def _is_stillborn(ledger: Ledger) -> bool:
-    """Whether a run failed there before its first row, as by a wrong argument of its learner.
+    """Whether a run failed there within its first iteration, as by a fault of its learner, and has no checkpoint.
 
     Nothing is lost if one of another config takes its place.
     """
     with contextlib.suppress(LedgerError):
         status = ledger.status()
-        began = status.checkpoint is not None or ledger.checkpoint_files() or (ledger.folder / METRICS).exists()
-        return status.state == "failed" and not began
+        if status.state == "failed" and status.checkpoint is None and not ledger.checkpoint_files():
+            return not any(row["kind"] == "iteration" for row in ledger.rows())
     return False
 
 
@@ -478,7 +476,7 @@ def _refuse_other_run(
         return stored
     # A larger budget alone would be allowed.
     like = longer if _may_grow(stored, config) else stored
-    changes = configs.differences(like, config) or configs.differences(stored, config)
+    changes = _differences(like, config) or _differences(stored, config)
     if taken.get("init_from") != given.get("init_from"):
         changes.append("init_from: other networks")
     if taken.get("curriculum.of") != given.get("curriculum.of"):
@@ -497,6 +495,23 @@ def _may_grow(stored: RunConfig, config: RunConfig) -> bool:
         return is_longer(stored, config)
     except ConfigError:
         return False
+
+
+def _differences(stored: RunConfig, config: RunConfig) -> list[str]:
+    """In words: of a section of another kind, whose keys all are others, the kind alone."""
+    found = configs.differences(stored, config)
+    kinds = [text for text in found if text.startswith(("learner.kind: ", "curriculum.kind: "))]
+    others = tuple(f"{text.partition('.')[0]}." for text in kinds)
+    return [*kinds, *(text for text in found if not text.startswith(others))]
+
+
+def _ways_out(config: RunConfig, ledger: Ledger) -> str:
+    """What to do where a run is there, by whether it seems to be this one."""
+    with contextlib.suppress(SpaceDistError):
+        may_grow = ("budget.", "schedule")
+        if not all(text.startswith(may_grow) for text in configs.differences(stored_config(ledger), config)):
+            return " of another configuration: --out DIR starts another (from Python: out=DIR)"
+    return ": --resume continues it, --out DIR starts another (from Python: resume=True, out=DIR)"
 
 
 def stored_config(ledger: Ledger) -> RunConfig:
@@ -595,10 +610,17 @@ def _failures_noted(writer: RunWriter) -> Iterator[None]:
         raise
     except BaseException as error:  # a user's environment may raise anything
         log.error("%s", traceback.format_exc())  # the traceback is for the log alone
-        where = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
+        where = "".join(f" ({note})" for note in getattr(error, "__notes__", ())) or _raised_in(error)
         what = f"{type(error).__name__}: {error}{where}"
         _note_failure(writer, what)
         raise SpaceDistError(f"the run failed: {what[:500]}. The traceback is in {writer.ledger.log}") from error
+
+
+def _raised_in(error: BaseException) -> str:
+    """` (my_learner.py, line 14, in train)`: where in a user's own code, if it came from there."""
+    installed = (*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), str(_PACKAGE), "<")
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(installed)]
+    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno}, in {own[-1].name})" if own else ""
 
 
 def _note_failure(writer: RunWriter, message: str, state: State = "failed") -> None:
