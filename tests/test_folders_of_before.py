@@ -19,7 +19,8 @@ import pytest
 from space_dist.experiment.manifest import Grid
 from space_dist.experiment.status import Attempts
 from space_dist.ledger import METRICS, Ledger
-from space_dist.run.launch import launch, stored_config
+from space_dist.run.claiming import stored_config
+from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.grids import ROOT
 from tests.patience import PATIENCE

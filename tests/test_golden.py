@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from space_dist.arithmetic import REFERENCE
-from space_dist.run.launch import arithmetic_digest
+from space_dist.run.claiming import arithmetic_digest
 from tests.golden.cases import CASES, run
 from tests.golden.emulation import GOLDEN
 

@@ -22,7 +22,8 @@ from space_dist.experiment.manifest import Grid, Run
 from space_dist.experiment.status import Attempts
 from space_dist.grid.planning import plan
 from space_dist.ledger import METRICS, this_process
-from space_dist.run.launch import launch, stored_config
+from space_dist.run.claiming import stored_config
+from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import private_ray
 from tests.grids import ROOT, write_grid

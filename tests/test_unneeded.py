@@ -10,7 +10,7 @@ from tests.patience import PATIENCE
 TRAINS = """
 import inspect, sys
 import space_dist.learner
-from space_dist.run.launch import arithmetic_digest
+from space_dist.run.claiming import arithmetic_digest
 import torch
 weights = torch.nn.Parameter(torch.ones(3))
 optimizer = torch.optim.SGD([weights], lr=0.5)

@@ -18,7 +18,8 @@ from space_dist.ledger import Ledger
 from space_dist.rollout.memory import Memory
 from space_dist.rollout.policy import Noise, Policy, policies_of
 from space_dist.run.building import spec_of
-from space_dist.run.launch import policy_of, stored_config
+from space_dist.run.claiming import stored_config
+from space_dist.run.launch import policy_of
 
 if TYPE_CHECKING:
     from space_dist.api.training import Run

@@ -20,7 +20,8 @@ from space_dist.experiment.places import run_folder
 from space_dist.ledger import METRICS, ROW_FILES, Ledger, Row, Status
 from space_dist.report import draw_learning_curve, load_run
 from space_dist.report.figures import png
-from space_dist.run.launch import launch, stored_config
+from space_dist.run.claiming import stored_config
+from space_dist.run.launch import launch
 from space_dist.run.training import Progress
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import default_folder, lasting

@@ -142,7 +142,7 @@ def arithmetic_here() -> Iterator[Finding]:
     from space_dist.errors import SpaceDistError
 
     try:
-        from space_dist.run.launch import arithmetic_digest
+        from space_dist.run.claiming import arithmetic_digest
 
         found = arithmetic_digest()
     except (ImportError, OSError, SpaceDistError) as error:

@@ -107,7 +107,8 @@ def evaluate(
     from space_dist.rollout import evaluate as evaluate_policy
     from space_dist.rollout.policy import policies_of
     from space_dist.run.building import spec_of
-    from space_dist.run.launch import policy_of, stored_config
+    from space_dist.run.claiming import stored_config
+    from space_dist.run.launch import policy_of
     from space_dist.seeding import Purpose, episode_seeds
 
     ledger = Ledger(there(run))
@@ -171,7 +172,7 @@ def explain(
     from space_dist.ledger import Ledger, there
     from space_dist.report.decisions import explain as explain_decision
     from space_dist.run.building import spec_of
-    from space_dist.run.launch import stored_config
+    from space_dist.run.claiming import stored_config
 
     ledger = Ledger(there(run))
     ledger.status()
@@ -193,7 +194,7 @@ def export_sb3(
 ) -> None:
     """Write a run's policy as a zip that Stable-Baselines3 loads."""
     from space_dist.ledger import Ledger, there
-    from space_dist.run.launch import stored_config
+    from space_dist.run.claiming import stored_config
     from space_dist.sb3.export import export_sb3 as export
 
     ledger = Ledger(there(run))

@@ -15,7 +15,7 @@ from typing import Any, Final
 from space_dist import config as configs
 from space_dist.errors import ConfigError
 from space_dist.ledger import Ledger
-from space_dist.run.launch import stored_config
+from space_dist.run.claiming import stored_config
 
 _FIRST_SEED: Final = 1000  # of continuations, unless the run has it itself
 

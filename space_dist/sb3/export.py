@@ -17,7 +17,7 @@ from space_dist.learner.networks import ALGORITHMS
 from space_dist.ledger import Checkpoint, Ledger
 from space_dist.rollout.policy import OBSERVATION_CLIP
 from space_dist.run.building import Blueprint, spec_of
-from space_dist.run.launch import stored_config
+from space_dist.run.claiming import stored_config
 from space_dist.sb3 import ContextVecEnv
 
 

@@ -19,7 +19,8 @@ from space_dist.ledger import folder as folder_module
 from space_dist.ledger import writer as writer_module
 from space_dist.report import load_run
 from space_dist.run.building import spec_of
-from space_dist.run.launch import launch, policy_of, stored_config
+from space_dist.run.claiming import stored_config
+from space_dist.run.launch import launch, policy_of
 from space_dist.system.files import read_file
 from space_dist.system.interrupts import StopRequests
 from tests.faults.test_every_write import short

@@ -14,7 +14,8 @@ import tempfile
 from pathlib import Path
 
 from space_dist import config as configs
-from space_dist.run.launch import arithmetic_digest, launch
+from space_dist.run.claiming import arithmetic_digest
+from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
 from tests.golden.cases import CASES, DIGESTS, run
 
