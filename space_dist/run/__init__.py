@@ -1,1 +1,4 @@
-"""One run: `training` is its loop, `building` makes its parts, `cluster` does its work, `claiming` makes a folder its own, `launch` starts it."""
+"""One run: `training` is its loop, `building` makes its parts, `cluster` does its work.
+
+`claiming` makes its folder this run's, or refuses to; `launch` starts it.
+"""
