@@ -362,7 +362,7 @@ def test_a_run_with_a_dashboard_ends_with_where_to_look(
 
     def start(pusher: Pusher, tracking: Mirrors, folder: Path, log_file: Path) -> None:
         said = 2 * "1 run is up to date in MLflow\\nLook at http://x/#/experiments/1 once\\n"  # a lost one's, too
-        pusher._where, pusher._folder, pusher._log_file = str(tracking.uri), folder, log_file
+        pusher.where, pusher._folder, pusher._log_file = str(tracking.uri), folder, log_file
         pusher._said_before = log_file.write_text("Look at an older page\n")
         pusher._process = subprocess.Popen(["/bin/sh", "-c", f"printf '{said}' >> {shlex.quote(str(log_file))}"])
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from space_dist.cli import terminal
 from space_dist.errors import ConfigError
 from space_dist.experiment.endings import Cause
 from space_dist.experiment.grid_file import GridConfig, load_grid
@@ -285,7 +286,7 @@ def test_no_number_of_a_setting_is_broken_whatever_the_width(
     arms = {"space": {"set": {"curriculum": {"kind": "space"}}}, named: {"set": {"curriculum": {"kind": "space"}}}}
     path = write_tune(tmp_path, arms=arms, generation=1)
     for columns in (80, 200):
-        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setattr(terminal.console, "_width", columns)  # COLUMNS is read when it is made
         assert command(monkeypatch, "tune", "plan", path, "--root", tmp_path / str(columns)) == 0
         told = capsys.readouterr().out
         rates = [trial.parameters["learner.learning_rate"]

@@ -55,10 +55,16 @@ def read(path: Path, *, to_check: bool = False) -> dict[str, Any]:
     """
     place = located(path)
     data = read_named(path)
-    if "env" not in data and not data.keys().isdisjoint(("arms", "extends")):
-        what, group, called = ("search", "tune", "run_search") if "arms" in data else ("grid", "grid", "run_grid")
-        command = f"plan {path}" if to_check else f"run {path} (from Python: space_dist.{called})"
-        raise ConfigError(f"{path} is a {what}, of many runs: space-dist {group} {command}")
+    if "env" not in data:
+        command = f"plan {path}" if to_check else f"run {path} (from Python: space_dist."
+        if "arms" in data:
+            raise ConfigError(
+                f"{path} is a search, of many runs: space-dist tune {command}{'' if to_check else 'run_search)'}"
+            )
+        if "extends" in data:
+            raise ConfigError(
+                f"{path} is a grid, of many runs: space-dist grid {command}{'' if to_check else 'run_grid)'}"
+            )
     refuse_profile(data, path)
     from_its_folder(data, place.absolute().parent)
     return data

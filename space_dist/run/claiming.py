@@ -269,13 +269,19 @@ def _differences(stored: RunConfig, config: RunConfig) -> list[str]:
     return [*kinds, *(text for text in found if not text.startswith(others))]
 
 
-def ways_out(config: RunConfig, ledger: Ledger) -> str:
-    """What to do where a run is there, by whether it seems to be this one."""
+def already_there(config: RunConfig, ledger: Ledger) -> str:
+    """That a run is there, and what to do, by whether it seems to be this one."""
     with contextlib.suppress(SpaceDistError):
         may_grow = ("budget.", "schedule")
         if not all(text.startswith(may_grow) for text in configs.differences(stored_config(ledger), config)):
-            return " of another configuration: --out DIR starts another (from Python: out=DIR)"
-    return ": --resume continues it, --out DIR starts another (from Python: resume=True, out=DIR)"
+            return (
+                f"{ledger.folder} already holds a run of another configuration: --out DIR starts another (from Python: "
+                "out=DIR)"
+            )
+    return (
+        f"{ledger.folder} already holds a run: --resume continues it, --out DIR starts another (from Python: "
+        "resume=True, out=DIR)"
+    )
 
 
 def stored_config(ledger: Ledger) -> RunConfig:

@@ -43,7 +43,7 @@ from space_dist.ledger import (
 from space_dist.rollout import Setup
 from space_dist.rollout.policy import Policy, Several, from_arrays
 from space_dist.run.building import Blueprint
-from space_dist.run.claiming import claim, is_stillborn, stored_config, ways_out
+from space_dist.run.claiming import already_there, claim, is_stillborn, stored_config
 from space_dist.run.cluster import Cluster, InProcess, n_workers
 from space_dist.run.training import Progress, Training
 from space_dist.system.extras import needed_from
@@ -216,7 +216,7 @@ def _begun(
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
     if ledger.exists() and not resume and not is_stillborn(ledger):
-        raise ConfigError(f"{folder} already holds a run{ways_out(config, ledger)}")
+        raise ConfigError(already_there(config, ledger))
     with RunWriter(ledger) as writer:
         status, goes_on = claim(blueprint, setup, writer, stop, pause_at)
         done = Outcome(ledger, already_done=status.has_reached(pause_at), next_round=blueprint.round_in_words)
