@@ -348,8 +348,9 @@ def in_root(path: Path, root: Path) -> Path:
 
 
 def _below(folder: Path) -> str:
-    """Which grids to name instead of a folder that is none."""
-    found = [str(grid.folder) for grid in grids_below(folder)]
+    """Which grids to name instead of a folder that is none: of two levels, as a home may hold a million files."""
+    files = sorted([*folder.glob(f"*/{MANIFEST}"), *folder.glob(f"*/*/{MANIFEST}")])
+    found = [str(file.parent) for file in files if Grid(file.parent).is_own()]
     if len(found) < 2:
         return "".join(f"; {one} does" for one in found)
     more = f" and {len(found) - _MAX_NAMED:,} more" if len(found) > _MAX_NAMED else ""
