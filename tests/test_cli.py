@@ -329,7 +329,7 @@ def test_asked_to_stop_it_ends_with_75_and_resumes_to_the_same_bytes(
     status = Ledger(folder).status()
     assert (code, status.state) == (75, "interrupted"), said
     assert 0 < status.steps < 4096
-    assert f"after {status.steps:,} steps; the same command with --resume goes on" in said
+    assert f"after {status.steps:,} steps; the same command goes on, `train` with --resume" in said
     code, _, _ = run(capsys, *train(out=folder), "--resume")
     assert code == 0
     assert same(folder, finished)

@@ -164,6 +164,8 @@ def explain(
         # A value is not repeated here: a URI may hold a password.
         if isinstance(context.get("error"), UriError):
             return f"{where}: {key}: {message}"
+        if given is None:
+            return f"{where}: {key}: is empty; {message}"
         return f"{where}: {key}: {message}, not {short(given)}"
     if given is None:
         return f"{where}: {key}: is empty; give it {_what_to_give(field, value, fault)}{_BESIDE.get(key, '')}"

@@ -168,7 +168,7 @@ class Manifest:
             )
         names = [name for cell in self.cells for name in (cell.label, cell.id)]
         hint = f"; did you mean {begun[0].label!r}?" if begun else nearest(text, names)
-        raise ConfigError(f"{self.name} has no cell {text!r}{hint} `space-dist grid status` lists them")
+        raise ConfigError(f"{self.name} has no cell {text!r}{hint} `space-dist grid status {self.name}` lists them")
 
     def run(self, cell: str, seed: int | None) -> Run:
         """One run; without a seed, of a cell that has one alone. Raises ConfigError if there is no such one."""

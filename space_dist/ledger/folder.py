@@ -23,7 +23,7 @@ State = Literal["running", "interrupted", "failed", "paused", "done"]
 _MAX_STATUS_BYTES = 1 << 20
 _CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
 GOES_BACK: Final = "`train --resume` goes back to the one before it"  # behind a damaged checkpoint, where that can be
-CONTINUES: Final = "the same command with --resume goes on (from Python: resume=True)"
+CONTINUES: Final = "the same command goes on, `train` with --resume (from Python: resume=True)"
 _SHOWN = 3  # runs that a sentence names; the rest are counted
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
 
