@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from space_dist.cli.terminal import keep_outputs, say, spread, warn  # isort: skip - before anything heavy
+from space_dist.cli.terminal import CTRL_C, keep_outputs, say, spread, warn  # isort: skip - before anything heavy
 
 import os
 import sys
@@ -23,6 +23,8 @@ from space_dist.cli.tuning import tune_app
 from space_dist.cli.worlds import env_app, render
 from space_dist.errors import ConfigError, SpaceDistError
 from space_dist.system.processes import collect_seldom
+
+_INTERRUPTED = 128 + 2  # SIGINT's exit code
 
 app = typer.Typer(
     name="space-dist", no_args_is_help=True, pretty_exceptions_enable=False,
@@ -70,6 +72,10 @@ def main() -> None:
         sys.exit(ConfigError.exit_code)
     try:
         app(args=spread(sys.argv[1:]))
+    except SystemExit as error:
+        if error.code == _INTERRUPTED:  # Typer's, which says nothing
+            warn(f"space-dist: {CTRL_C}")
+        raise
     except SpaceDistError as error:
         for line in str(error).splitlines():
             warn(f"space-dist: {line}")

@@ -17,7 +17,21 @@ import io
 import re
 import select
 import sys
+from types import TracebackType
 from typing import Any
+
+CTRL_C = "ended by Ctrl-C"
+
+
+def _end_in_a_sentence(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Of Ctrl-C while the command itself is being imported, which no handler hears yet; of all else Python's own."""
+    if issubclass(kind, KeyboardInterrupt):
+        os.write(2, f"space-dist: {CTRL_C}\n".encode())
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
+sys.excepthook = _end_in_a_sentence
 
 _READER_SECONDS = 60.0  # without reading, after which the reader of an output that does not block is taken to have left
 

@@ -249,7 +249,8 @@ def _refuse_other_run(
         changes.append("instances: other contexts or ids")
     raise ConfigError(
         f"{ledger.folder} holds a run of another configuration ({'; '.join(changes)}). A run's settings cannot change "
-        "on the way: use --out DIR for a new run (from Python: out=DIR)"
+        "on the way: give all that it was begun with again, or use --out DIR for a new run (from Python: overrides, "
+        "out=DIR)"
     )
 
 
