@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 import subprocess
@@ -170,7 +171,7 @@ def test_what_a_population_found_is_confirmed_as_a_schedule(evolved: tuple[Path,
     shutil.copytree(evolved[1].folder, tmp_path / "search")
     grid = Grid(tmp_path / "search")
     manifest = grid.manifest()
-    confirmation(grid, manifest)
+    written = confirmation(grid, manifest)
     found = 0
     for arm in search_of(manifest).arms:
         best = search_of(manifest).best(arm)
@@ -179,7 +180,7 @@ def test_what_a_population_found_is_confirmed_as_a_schedule(evolved: tuple[Path,
         assert ("schedule:" in text) == (best.parent >= 0)
         found += best.parent >= 0
     assert found
-    assert "space-dist tune confirm" in build_search_report(grid, tmp_path / "before").summary[1]
+    assert f"space-dist grid run {written} " in build_search_report(grid, tmp_path / "before").summary[1]
     whole = grid.folder / "confirm/search-confirm.yaml"
     command = [sys.executable, "-m", "space_dist.cli", "grid", "run", whole, "--root", tmp_path]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, timeout=PATIENCE).returncode == 0
@@ -231,7 +232,15 @@ def test_a_member_that_fails_is_replaced(tmp_path: Path) -> None:
 def test_status_tells_whose_copies_there_are(evolved: tuple[Path, Grid]) -> None:
     command = [sys.executable, "-m", "space_dist.cli", "tune", "status", str(evolved[1].folder)]
     table, told = (
-        subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
+        subprocess.run(
+            [*command, *more],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=True,
+            env={**os.environ, "COLUMNS": "200"},
+        ).stdout
         for more in ([], ["--json"])
     )
     heads = next(line for line in table.splitlines() if "trial" in line)
@@ -304,7 +313,7 @@ def test_a_population_keeps_its_size(evolved: tuple[Path, Grid]) -> None:
     path, undisturbed = evolved
     larger = population_tune(path.parent, trials=5)
     try:
-        with pytest.raises(ConfigError, match="begun with a population of 4"):
+        with pytest.raises(ConfigError, match="has a population of 4, which cannot change its size"):
             plan_search(larger, undisturbed.folder.parent)
     finally:
         population_tune(path.parent)

@@ -542,7 +542,7 @@ def test_a_column_of_the_csv_is_read_stored_and_asked_for(tmp_path: Path) -> Non
     assert bare.digest() != found.digest()
     path.write_text("id,b,a\n7,1.0,0.5\n")
     assert read_csv(path, BOUNDS, ("effort",), if_there=True).columns == {}
-    with pytest.raises(ConfigError, match="the column 'effort' is missing"):
+    with pytest.raises(ConfigError, match="there is no column 'effort', which columns names"):
         read_csv(path, BOUNDS, ("effort",))
     path.write_text("id,b,a,effort\n7,1.0,0.5,much\n")
     with pytest.raises(ConfigError, match="row 2, column 'effort': 'much' is not a number"):

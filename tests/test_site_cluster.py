@@ -153,7 +153,7 @@ def test_the_pages_on_a_cluster(place: Place, monkeypatch: pytest.MonkeyPatch) -
     assert Ledger(shell.folder / "runs/cartpole_space/s0").status().state == "done"
     shell.block("grids.md", 2, {
         "[--watch] [--json] [--by-cause]": "--watch --json --by-cause", "[--follow]": "--follow",
-        "GRID": "runs/pointmass_small", "'CELL' --seed 3 ": "'space kappa=16' --seed 0 ",
+        "GRID": "runs/pointmass_small", "'CELL' [--seed 3] ": "'space kappa=16' --seed 0 ",
         "http://HOST:5000": place.server.address,
     })  # fmt: skip
     shell.run(

@@ -140,8 +140,8 @@ def _refuse_trials(grid: Grid, begun: Manifest, wanted: int) -> None:
     trials, each = int(search.config["trials"]), int(search.config["generation"])
     if search.config["population"] is not None:
         raise ConfigError(
-            f"trials: {grid.folder} was planned with a population of {trials}, which cannot change its "
-            f"size. {_ways_out(grid, begun)}"
+            f"trials: {grid.folder} has a population of {trials}, which cannot change its size. "
+            f"{_ways_out(grid, begun)}"
         )
     asked_of_each = search.asked // len(search.arms)
     # As long as there are more to ask, every generation was asked whole.
