@@ -529,7 +529,8 @@ def test_only_files_of_rows_are_read_as_such(tmp_path: Path) -> None:
     with pytest.raises(LedgerError, match=r"config\.yaml is no run's folder: it is a file$"):
         space_dist.Run(run.folder / "config.yaml")
     more = config_for(tmp_path, learner_section("ppo", n_epochs=3), budget={"steps": 8 * N_STEPS})
-    with pytest.raises(ConfigError, match=r"\(learner\.n_epochs: \d+ -> 3\)\. A run's .*\(from Python: overrides, out=DIR\)"):
+    said = r"\(learner\.n_epochs: \d+ -> 3\)\. A run's .*\(from Python: overrides, out=DIR\)"
+    with pytest.raises(ConfigError, match=said):
         space_dist.train(more, out=run.folder, resume=True, progress=False)
 
 
