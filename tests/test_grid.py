@@ -9,6 +9,7 @@ import os
 import random
 import subprocess
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -439,24 +440,28 @@ def test_a_stopped_run_lacks_no_explanation(
     assert way == f"`space-dist grid retry {grid.folder} --cause killed` gives another try"
 
 
+def between_looks(monkeypatch: pytest.MonkeyPatch, then: Mapping[int, Callable[[], object]], most: int) -> list[int]:
+    """How often a command that watches has looked; `then`: what happens behind its n-th look."""
+    looks = [0]
+
+    def look(seconds: float) -> None:  # noqa: ARG001 - the signature is `time.sleep`'s
+        looks[0] += 1
+        then.get(looks[0], lambda: None)()
+        assert looks[0] < most
+
+    monkeypatch.setattr("space_dist.cli.grids.time.sleep", look)
+    return looks
+
+
 def test_watching_from_a_pipe_prints_what_has_changed(
     one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid, _, run = one
-    looks, lock = [0], Lock(grid.lock_file)
-
-    def look(seconds: float) -> None:  # noqa: ARG001 - the signature is `time.sleep`'s
-        looks[0] += 1
-        if looks[0] == 3:
-            lock.acquire()
-        elif looks[0] == 6:
-            Attempts(grid.ledger(run)).begin(1, {})
-        elif looks[0] == 8:
-            Attempts(grid.ledger(run)).end(1, Ended(Cause.STOPPED))
-            lock.release()
-        assert looks[0] < 20
-
-    monkeypatch.setattr("space_dist.cli.grids.time.sleep", look)
+    lock, attempts = Lock(grid.lock_file), Attempts(grid.ledger(run))
+    looks = between_looks(monkeypatch, {
+        3: lock.acquire, 6: lambda: attempts.begin(1, {}), 8: lambda: attempts.end(1, Ended(Cause.STOPPED)),
+        9: lock.release,
+    }, most=20)  # fmt: skip
     assert command(monkeypatch, "grid", "status", grid.folder, "--watch") == 3
     assert looks[0] > 8
     assert 3 <= capsys.readouterr().out.count("runs done") <= 5
@@ -480,17 +485,8 @@ def test_following_a_run_ends_when_nobody_works_any_more(
     one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid, _, run = one
-    looks, lock = [0], Lock(grid.lock_file)
-
-    def look(seconds: float) -> None:  # noqa: ARG001 - the signature is `time.sleep`'s
-        looks[0] += 1
-        if looks[0] == 3:
-            lock.acquire()
-        elif looks[0] == 5:
-            lock.release()
-        assert looks[0] < 10
-
-    monkeypatch.setattr("space_dist.cli.grids.time.sleep", look)
+    lock = Lock(grid.lock_file)
+    looks = between_looks(monkeypatch, {3: lock.acquire, 5: lock.release}, most=10)
     monkeypatch.setattr("space_dist.cli.grids.STOP", StopRequests())
     follow = ("grid", "logs", grid.folder, "kappa=1", "--seed", run.seed, "--follow")
     assert command(monkeypatch, *follow) == 0
