@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
+CONTINUES: Final = "the same command goes on, `train` with --resume (from Python: resume=True)"
+_NAMED = 3  # folders that a sentence names; the rest are counted
 _SECTION_AND_KEY: Final = re.compile(r"[a-z]\w*(?:\.\w+)+")
 _SECTION: Final = re.compile(r"(?<![\w.])[a-z]\w*(?=:| = )")
 
@@ -77,6 +80,15 @@ def misspelt(word: str, allowed: Iterable[str]) -> str:
 def counted(number: int, what: str) -> str:
     """`1 run`, `2,000 runs`."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def below(folders: Sequence[Path]) -> str:
+    """Which of these to name instead of a folder that is none of their kind itself, behind that it is not."""
+    if len(folders) < 2:
+        return "".join(f"; {folder} does" for folder in folders)
+    more = f" and {len(folders) - _NAMED:,} more" if len(folders) > _NAMED else ""
+    named = ", ".join(map(str, folders[:_NAMED]))
+    return f"; {len(folders):,} folders below it do, of which one is to be named: {named}{more}"
 
 
 @contextlib.contextmanager

@@ -378,8 +378,8 @@ def test_empty_sections_are_told_what_they_need(key: str, value: str, said: str,
         ("learner.gamma", "give it a number from 0 to 1, or leave the key out"),
         ("learner.net_arch", "give it a list, [] for none, or leave the key out"),
         ("rollout.slots", "give it a whole number from 1 to 65,536, or leave the key out"),
-        ("budget.steps", "give it a whole number from 1 to 1,000,000,000,000; budget.episodes, which may end a run "
-                         "before, stands beside it, and not instead"),
+        ("budget.steps", "give it a whole number from 1 to 1,000,000,000,000: budget.episodes is a limit beside it, "
+                         "and the one that is reached first ends a run"),
         ("evaluation.every_steps", "give it a whole number or log, or leave the key out"),
         ("env.kwargs.horizon", "give it true or false, a number, or a text, or leave it out"),
     ],

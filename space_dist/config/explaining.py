@@ -58,8 +58,10 @@ _TAKES_KWARGS = {EnvConfig: "the environment", CustomConfig: "a curriculum of yo
 _CUSTOM = "custom"
 _OWN_CURRICULUM = f"a curriculum of your own, which import names, has `kind: {_CUSTOM}`"
 
-# Of keys that some take to be instead of another: what stands behind a sentence about their lack.
-_BESIDE: Final = {"budget.steps": "; budget.episodes, which may end a run before, stands beside it, and not instead"}
+# Of keys that some take another to be instead of: what stands behind a sentence about their lack.
+_BESIDE: Final = {
+    "budget.steps": ": budget.episodes is a limit beside it, and the one that is reached first ends a run",
+}
 
 
 def schema(of: type[BaseModel] = RunConfig) -> Iterator[tuple[str, str, str, str]]:
@@ -142,7 +144,7 @@ def explain(
             way_out = f"; as an argument it is written **{{{path[-1]!r}: ...}}"
         needed = f": a section with {needs}" if (needs := _needs(options)) else ""
         if key == "budget.steps" and isinstance(given, Mapping) and "episodes" in given:
-            needed = ": budget.episodes is a limit beside it, and the one that is reached first ends a run"
+            needed = _BESIDE[key]
         return f"{where}: {key}: this key is required{needed}{way_out}{_allowed_kinds(options)}"
     if kind in ("model_type", "model_attributes_type"):
         # An item of a list, or what a user's own name stands for, is no field: then the model is its own.

@@ -22,7 +22,7 @@ from typing import Any
 
 from space_dist import config as configs
 from space_dist.config import NAME, ResourcesConfig, RunConfig, Section
-from space_dist.errors import ConfigError, LedgerError, NotPlannedError, nearest
+from space_dist.errors import ConfigError, LedgerError, NotPlannedError, below, nearest
 from space_dist.experiment import scaling
 from space_dist.experiment.grid_file import GridConfig, GridTracking, Retry, RunResources, refuse_others
 from space_dist.experiment.search import Search
@@ -350,11 +350,7 @@ def in_root(path: Path, root: Path) -> Path:
 def _below(folder: Path) -> str:
     """Which grids to name instead of a folder that is none: of two levels, as a home may hold a million files."""
     files = sorted([*folder.glob(f"*/{MANIFEST}"), *folder.glob(f"*/*/{MANIFEST}")])
-    found = [str(file.parent) for file in files if Grid(file.parent).is_own()]
-    if len(found) < 2:
-        return "".join(f"; {one} does" for one in found)
-    more = f" and {len(found) - _MAX_NAMED:,} more" if len(found) > _MAX_NAMED else ""
-    return f"; {len(found):,} folders below it do, of which one is to be named: {', '.join(found[:_MAX_NAMED])}{more}"
+    return below([file.parent for file in files if Grid(file.parent).is_own()])
 
 
 def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()) -> Grid:

@@ -39,7 +39,7 @@ from space_dist.ledger.checkpoint import (
     encode_arrays,
     encode_checkpoint,
 )
-from space_dist.ledger.folder import CONTINUES, GIVEN, GOES_BACK, Ledger, State, Status, find_ledgers, there
+from space_dist.ledger.folder import GIVEN, GOES_BACK, Ledger, State, Status, find_ledgers, there
 from space_dist.ledger.lock import LEASE_SECONDS, Lock, believed_alive, owner_alive, process_of, this_process
 from space_dist.ledger.rows import (
     CURRICULUM,
@@ -57,7 +57,6 @@ from space_dist.ledger.rows import (
 from space_dist.ledger.writer import RunWriter
 
 __all__ = [
-    "CONTINUES",
     "CURRICULUM",
     "FORMAT",
     "GIVEN",

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
-from space_dist.errors import LedgerError, NotPlannedError, nearest
+from space_dist.errors import LedgerError, NotPlannedError, below, nearest
 from space_dist.ledger.checkpoint import FORMAT, READABLE, Checkpoint, decode_checkpoint
 from space_dist.ledger.lock import owner_alive
 from space_dist.ledger.rows import METRICS, ROW_FILES, Row, decode_row
@@ -23,8 +23,6 @@ State = Literal["running", "interrupted", "failed", "paused", "done"]
 _MAX_STATUS_BYTES = 1 << 20
 _CHECKPOINT = re.compile(r"round-[0-9]{9,12}\.npz")
 GOES_BACK: Final = "`train --resume` goes back to the one before it"  # behind a damaged checkpoint, where that can be
-CONTINUES: Final = "the same command goes on, `train` with --resume (from Python: resume=True)"
-_SHOWN = 3  # runs that a sentence names; the rest are counted
 _READINGS = 3  # of a file and the status that names it, which a live writer may be replacing
 
 
@@ -241,11 +239,7 @@ def _file_in(path: Path) -> str:
 def _below(folder: Path) -> str:
     """Which runs to name instead of a folder that holds none itself: its own, or, of a grid, those of its cells."""
     found = sorted([*folder.glob("*/status.json"), *folder.glob("*/*/status.json")])
-    if len(found) < 2:
-        return "".join(f"; {file.parent} does" for file in found)
-    named = ", ".join(str(file.parent) for file in found[:_SHOWN])
-    more = f" and {len(found) - _SHOWN:,} more" if len(found) > _SHOWN else ""
-    return f"; {len(found):,} folders below it do, of which one is to be named: {named}{more}"
+    return below([file.parent for file in found])
 
 
 def there(path: Path) -> Path:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from space_dist.errors import RunLockedError
+from space_dist.errors import CONTINUES, RunLockedError
 from space_dist.system.files import locked, read_file
 
 LEASE_SECONDS = 120.0  # how long an owner that cannot be seen from here is believed to live after its last sign
@@ -188,7 +188,7 @@ class Lock:
             except TimeoutError as error:
                 raise RunLockedError(
                     f"cannot write to {self._path.parent}: {error.strerror}. What was committed is intact; once the "
-                    "lock is free, --resume continues (from Python: resume=True)"
+                    f"lock is free, {CONTINUES}"
                 ) from None
             owner = self._read(file)
             if not self._is_mine(owner):

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from numpy.typing import NDArray
 
-from space_dist.errors import LedgerError, UnreadableError
+from space_dist.errors import CONTINUES, LedgerError, UnreadableError
 from space_dist.ledger.checkpoint import (
     Checkpoint,
     Segment,
@@ -28,7 +28,7 @@ from space_dist.ledger.checkpoint import (
     encode_checkpoint,
     rows_under,
 )
-from space_dist.ledger.folder import CONTINUES, Ledger, State, Status, read_whole
+from space_dist.ledger.folder import Ledger, State, Status, read_whole
 from space_dist.ledger.lock import Lock
 from space_dist.ledger.rows import ROW_FILES, Row, encode_row
 from space_dist.system.files import TEMPORARIES, appending, atomic_write, own_folder, read_file, why_not_own

@@ -25,6 +25,7 @@ from space_dist import arithmetic
 from space_dist.config import RunConfig
 from space_dist.envs.spec import EnvironmentSpec
 from space_dist.errors import (
+    CONTINUES,
     ConfigError,
     Interrupted,
     LedgerError,
@@ -34,7 +35,6 @@ from space_dist.errors import (
     exits_refused,
 )
 from space_dist.ledger import (
-    CONTINUES,
     Ledger,
     RunWriter,
     State,

@@ -32,7 +32,7 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from space_dist.arithmetic import settings as arithmetic_settings
 from space_dist.config import RunConfig
-from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.errors import CONTINUES, ConfigError, Interrupted, SpaceDistError
 from space_dist.rollout import FloatArray, IntArray, Setup, Split
 from space_dist.rollout.walk import Walk
 from space_dist.run.cluster import Decision, Evidence, Handle, n_workers
@@ -331,8 +331,7 @@ class RayCluster:
                 if call.attempts == _ATTEMPTS:
                     what = "took too long" if reason is None else f"{type(reason).__name__}: {first_line(reason)}"
                     raise SpaceDistError(
-                        f"the same work was lost {_ATTEMPTS} times ({what}). What was committed is intact; "
-                        "--resume continues"
+                        f"the same work was lost {_ATTEMPTS} times ({what}). What was committed is intact; {CONTINUES}"
                     ) from reason
                 self._submit(call)
                 moved.update(call.answers)

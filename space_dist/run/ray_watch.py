@@ -21,7 +21,7 @@ from typing import Literal
 
 import psutil
 
-from space_dist.errors import Interrupted, SpaceDistError
+from space_dist.errors import CONTINUES, Interrupted, SpaceDistError
 
 REACH_SECONDS = 30.0  # to get an answer from an address, before Ray is asked to join it
 JOIN_SECONDS = 300.0  # for `ray.init` to join: more than it takes on a busy machine, less than its own 824 s
@@ -223,7 +223,7 @@ def _watch(
             if waited >= limits[answer] and (answer == "silent" or gone) and not over.is_set():
                 did = "has died" if answer == "gone" else f"has not answered anything for {waited:.0f} s"
                 _end(
-                    f"{name} of the Ray {where} {did}. What was committed is intact; --resume continues", started,
+                    f"{name} of the Ray {where} {did}. What was committed is intact; {CONTINUES}", started,
                     Interrupted.exit_code, note,
                 )  # fmt: skip
 

@@ -33,10 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.curricula import GENERATED, Selection, decode_state, encode_state
-from space_dist.errors import Interrupted
+from space_dist.errors import CONTINUES, Interrupted
 from space_dist.learner import Arrays, Update
 from space_dist.ledger import (
-    CONTINUES,
     CURRICULUM,
     METRICS,
     MOST_VALUED,
