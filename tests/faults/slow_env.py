@@ -1,12 +1,14 @@
 """The tiny line, slowly: `tests.faults.slow_env:make`, for rounds that are longer than the grace time.
 
 A step takes as many seconds as the environment variable PAUSE says: the same config is fast where there is none.
+A step that pauses makes the file that STEPPING names, if it does.
 """
 
 from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from space_dist.envs.interface import Step
 from tests.tiny_env import Line
 
 PAUSE = "SPACE_DIST_TEST_PAUSE"
+STEPPING = "SPACE_DIST_TEST_STEPPING"
 
 
 class Slow(Line):
@@ -25,6 +28,8 @@ class Slow(Line):
         self._seconds = float(os.environ.get(PAUSE, "0"))
 
     def step(self, actions: NDArray[np.generic]) -> Step:
+        if self._seconds > 0 and STEPPING in os.environ:
+            Path(os.environ[STEPPING]).touch()
         time.sleep(self._seconds)
         return super().step(actions)
 

@@ -20,7 +20,7 @@ from space_dist.ledger import Ledger
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import STOP_SIGNALS, StopRequests
 from tests import prepared
-from tests.faults.slow_env import PAUSE
+from tests.faults.slow_env import PAUSE, STEPPING
 from tests.faults.test_every_write import short
 from tests.patience import PATIENCE
 from tests.test_learners import results
@@ -112,13 +112,15 @@ def test_a_round_longer_than_the_grace_time_ends_with_75_on_the_last_checkpoint(
 
 
 def test_a_second_ctrl_c_ends_at_once_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = tmp_path / "said.txt"
+    said, stepping = tmp_path / "said.txt", tmp_path / "stepping"
     monkeypatch.setenv(PAUSE, "5")
+    monkeypatch.setenv(STEPPING, str(stepping))
     process = prepared.command(command(tmp_path, env="tests.faults.slow_env:make"), said)
     monkeypatch.delenv(PAUSE)
+    monkeypatch.delenv(STEPPING)
     try:
         deadline = time.monotonic() + PATIENCE
-        while not (tmp_path / "run" / "log.txt").exists() and time.monotonic() < deadline:
+        while not stepping.exists() and time.monotonic() < deadline:  # before it, a first Ctrl-C ends at once
             time.sleep(0.01)
         send(process, signal.SIGINT)
         while "another Ctrl-C" not in said.read_text() and time.monotonic() < deadline:
