@@ -16,11 +16,13 @@ from space_dist import arithmetic
 from space_dist import config as configs
 from space_dist.arithmetic import digest, scipy_checks
 from space_dist.errors import SpaceDistError
+from space_dist.grid.planning import plan
 from space_dist.ledger import METRICS, Ledger
 from space_dist.run import ray_actors
 from space_dist.run.building import Blueprint
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import StopRequests
+from tests.grids import write_grid
 from tests.patience import PATIENCE
 from tests.test_distributed import ROOT, config, reference, results  # noqa: F401
 from tests.test_learners import config_for, learner_section
@@ -137,6 +139,30 @@ def test_actors_close_their_environments_where_a_run_ends(tmp_path: Path) -> Non
     files = [path.name for path in noted.iterdir()]
     assert len({name.partition("-")[0] for name in files}) == 3  # processes: two actors, and the driver, to look at one
     assert [name for name in files if not name.endswith(".closed")] == []
+
+
+def test_the_ray_that_auto_took_is_named(tmp_path: Path) -> None:
+    """To whoever waits, in a line that stays, and in the run's log; of a Ray of our own there is nothing to tell."""
+    import ray
+
+    from space_dist.grid.jobs import _joined
+
+    one, told = ray.get_runtime_context().gcs_address, list[str]()
+    waited: dict[str, list[str]] = {"auto": [], "local": []}
+    for address, lines in waited.items():
+        run = config(1, f"resources.address={address}")
+        launch(run, tmp_path / address, resume=True, stop=StopRequests(), waiting=lines.append, tell=told.append)
+    assert told == [f"joined the Ray at {one} (auto)"]
+    there = f"waiting for room for 1 rollout actor on the Ray at {one} (auto)"
+    assert waited["auto"] == ["joining the Ray at auto", there, "preparing the learner"]
+    assert waited["local"] == ["starting Ray with 1 rollout actor", "preparing the learner"]
+    assert f"INFO {told[0]}\n" in (tmp_path / "auto/log.txt").read_text()
+    said = list[str]()
+    for address in waited:
+        manifest = plan(write_grid(tmp_path), tmp_path / "runs").manifest
+        with _joined(address, manifest, 1, lambda: None, said.append):
+            pass
+    assert said == [f"{manifest.name}: on the Ray at {one} (auto)"]
 
 
 @pytest.mark.parametrize(("fault", "ends"), [("exit", "failed"), ("_exit", "done")])

@@ -156,6 +156,7 @@ def test_a_search_ends_as_it_does_without_a_cluster(
     )  # fmt: skip
     said = process.communicate(timeout=PATIENCE)[0]
     assert process.returncode == 0, said
+    assert f"search: on the Ray at {cluster.cluster} (auto)\n" in said
     grid = Grid(tmp_path / "runs/search")
     assert grid.manifest_file.read_bytes() == here.manifest_file.read_bytes()
     runs = grid.manifest().runs()

@@ -141,6 +141,7 @@ def worked_through(
     place: Grid, manifest: Manifest, runs: Sequence[manifests.Run], *, stop: StopRequests,
     observe: Callable[[Overview], None], address: str = "local", mode: Mode = "auto", max_parallel: int | None = None,
     nodes: int = 1, server: ForkServer | None = None, reinstall: Callable[[], None] = lambda: None,
+    say: Callable[[str], None] = lambda line: None,
 ) -> list[RunStatus]:  # fmt: skip
     """Work through runs of a frozen grid; returns where they stand in the end. Arguments: as of `grid.jobs.conduct`.
 
@@ -159,5 +160,5 @@ def worked_through(
 
     return conduct(
         place, manifest, runs, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
-        stop_requested=stop.reason, reinstall=reinstall, observe=observe,
+        stop_requested=stop.reason, reinstall=reinstall, observe=observe, say=say,
     )  # fmt: skip

@@ -82,7 +82,7 @@ def searched_through(
 ) -> Manifest:  # fmt: skip
     """Work through generation after generation of a planned search; returns its manifest in the end.
 
-    For whoever works on the grid. Arguments: as of `worked_through`. say: hears of every generation. Raises as
+    For whoever works on the grid. Arguments: as of `worked_through`. say: hears of every generation, too. Raises as
     `advance`, and Interrupted if asked to stop.
     """
     with needed_from("tune", "a search"):
@@ -96,7 +96,7 @@ def searched_through(
             with observing(manifest) as observe:
                 worked_through(
                     place, manifest, runs, stop=stop, observe=observe, address=address, mode=mode,
-                    max_parallel=max_parallel, nodes=nodes, server=server, reinstall=reinstall,
+                    max_parallel=max_parallel, nodes=nodes, server=server, reinstall=reinstall, say=say,
                 )  # fmt: skip
         after = advance(place, manifest)
         if after is None:  # somebody has let a failed run be tried again meanwhile

@@ -459,7 +459,7 @@ def run_frozen(
         observe = stack.enter_context(display(manifest, place))
         return worked_through(
             place, manifest, chosen, address=address, mode=mode, max_parallel=max_parallel, nodes=nodes,
-            server=server, stop=STOP, reinstall=STOP.install, observe=observe,
+            server=server, stop=STOP, reinstall=STOP.install, observe=observe, say=say,
         )  # fmt: skip
 
 

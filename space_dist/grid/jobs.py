@@ -61,15 +61,15 @@ _MAX_JOB_NAME = 60  # characters of a grid's name in its job's, which people rea
 def conduct(
     grid: Grid, manifest: Manifest, runs: Sequence[Run], *, address: str, mode: Mode, max_parallel: int | None,
     nodes: int, stop_requested: Callable[[], str | None], reinstall: Callable[[], None],
-    observe: Callable[[Overview], None] = lambda overview: None,
+    observe: Callable[[Overview], None] = lambda overview: None, say: Callable[[str], None] = lambda line: None,
 ) -> list[RunStatus]:  # fmt: skip
     """Work through `runs` on a private Ray (`address` local) or the cluster we are in; returns where they stand.
 
     max_parallel: runs at a time; None: as many as fit. nodes: how many to wait for at first. `reinstall` is called
-    after Ray has taken the signal handlers. Raises SpaceDistError if there is no room for one run, Interrupted if asked
-    to stop.
+    after Ray has taken the signal handlers. say: hears which cluster that is. Raises SpaceDistError if there is no room
+    for one run, Interrupted if asked to stop.
     """
-    with _joined(address, manifest, max_parallel, stop_requested) as dashboard:
+    with _joined(address, manifest, max_parallel, stop_requested, say) as dashboard:
         # `ray.init` replaces the handler of SIGTERM.
         reinstall()
         _await_nodes(nodes, stop_requested)
@@ -88,7 +88,8 @@ def conduct(
 
 @contextlib.contextmanager
 def _joined(
-    address: str, manifest: Manifest, max_parallel: int | None, stop_requested: Callable[[], str | None]
+    address: str, manifest: Manifest, max_parallel: int | None, stop_requested: Callable[[], str | None],
+    say: Callable[[str], None],
 ) -> Iterator[str]:  # fmt: skip
     """The address of the dashboard, which is the job server's; empty on a private Ray, which has none."""
 
@@ -96,8 +97,13 @@ def _joined(
         if reason := stop_requested():
             raise Interrupted(f"stopped before Ray was started ({reason})")
 
+    def joined(which: str) -> None:
+        log.info("joined the Ray at %s", which)
+        say(f"{manifest.name}: on the Ray at {which}")
+
     # A run with rollout actors may have more processes than this machine has cores; they share them.
-    context = join_ray(address, max(cores(), (max_parallel or 1) * manifest.cpus_per_run), raise_if_stopped)
+    most = max(cores(), (max_parallel or 1) * manifest.cpus_per_run)
+    context = join_ray(address, most, raise_if_stopped, joined=joined)
 
     def leave() -> None:
         if ray_answers(context["gcs_address"]):

@@ -301,13 +301,22 @@ def _cluster(
         waiting(f"starting Ray with {actors}")
         private_ray()
     else:
-        waiting(f"waiting for room for {actors} on the Ray at {config.resources.address}")
+        waiting(f"joining the Ray at {config.resources.address}")
     with needed_from("ray", f"resources.workers: {workers}", "use resources.workers=0"):
         from space_dist.run.ray_cluster import RayCluster  # it takes a second, and is not needed without workers
 
+    def joined(which: str) -> None:
+        sentence = f"joined the Ray at {which}"
+        log.info("%s", sentence)
+        if config.resources.address == "auto":  # nobody has said which one, and the next line may pass at once
+            tell(sentence)
+        waiting(f"waiting for room for {actors} on the Ray at {which}")
+
     with contextlib.ExitStack() as stack:
         with active.stop.keeping_handlers():  # ray.init would replace SIGTERM's handler
-            cluster = stack.enter_context(RayCluster(config, active.setup, active.raise_if_stopped, active.note, told))
+            cluster = stack.enter_context(
+                RayCluster(config, active.setup, active.raise_if_stopped, active.note, told, joined)
+            )
         yield cluster
 
 

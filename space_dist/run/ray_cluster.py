@@ -106,11 +106,12 @@ class RayCluster:
     def __init__(
         self, config: RunConfig, setup: Setup, raise_if_stopped: Callable[[], None] = lambda: None,
         note: Note = nowhere, tell: Callable[[str], None] = log.warning,
+        joined: Callable[[str], None] = lambda which: None,
     ) -> None:  # fmt: skip
-        """As `join_ray` for `raise_if_stopped` and `note`. tell: hears of what is lost, and puts it into the log."""
+        """As `join_ray` for `raise_if_stopped`, `note` and `joined`. tell: hears of what is lost, and logs it."""
         self._config, self._resources, self._setup = config, config.resources, setup
         self._workers = max(1, n_workers(config, setup.spec))
-        self._raise_if_stopped, self._note, self._tell = raise_if_stopped, note, tell
+        self._raise_if_stopped, self._note, self._tell, self._joined = raise_if_stopped, note, tell, joined
         self._computing = [computes_with(config, setup, central=central) for central in (False, True)]
         self._room: PlacementGroup | None = None
         self._actors: dict[int, Any] = {}  # by index
@@ -127,7 +128,7 @@ class RayCluster:
 
     def __enter__(self) -> RayCluster:
         resources = self._resources
-        found = join_ray(resources.address, self._workers + 1, self._raise_if_stopped, self._note)
+        found = join_ray(resources.address, self._workers + 1, self._raise_if_stopped, self._note, self._joined)
         self._session = found["session_dir"] if resources.address == "local" else None
         self._watch.enter_context(attended(found, resources.address, gone=True, leave=shut_down, note=self._note))
         try:

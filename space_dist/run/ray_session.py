@@ -53,14 +53,15 @@ class _Driver(JobConfig):
 
 
 def join_ray(
-    address: str, cpus: int, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere
+    address: str, cpus: int, raise_if_stopped: Callable[[], None] = lambda: None, note: Note = nowhere,
+    joined: Callable[[str], None] = lambda which: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Start a Ray of our own with `cpus` CPUs (`address` local), or join the one at `address`; what it says of itself.
 
     A start that fails is tried again: Ray gives some of its processes 15 s, which no setting changes, and which are
     not enough on a busy machine. While that lasts, `raise_if_stopped` is called, and may raise what ends it. Raises
     SpaceDistError if Ray cannot be started or reached; where it takes our call and does not return, the process ends
-    with that, and `note` is told.
+    with that, and `note` is told. joined: told which one was, `10.0.0.1:6379 (auto)`, as soon as it is.
     """
     where = f"at {address!r} (resources.address, or --address)"
     ours = address == "local"
@@ -98,6 +99,8 @@ def join_ray(
                     process.kill()
         else:
             found: dict[str, Any] = context.address_info  # type: ignore[attr-defined]
+            if not ours:
+                joined(f"{found['gcs_address']} (auto)" if address == "auto" else address)
             return {**found, "started": started}
 
 
