@@ -170,6 +170,8 @@ def test_what_does_not_finish_is_no_speed(monkeypatch: pytest.MonkeyPatch, capsy
     said = capsys.readouterr().out
     assert "(16), 1 torch thread: none finished\n" in said
     assert "(64), 1 torch thread: 250 steps/s\n" in said
+    told = ["is tried, for 60 s at most", "none finished"], ["is tried, for 60 s at most", "250 steps/s"]
+    assert [line.rpartition(": ")[2] for line in said.splitlines()] == [*told[0], *told[1]]
     rates[64] = 0.0
     with pytest.raises(
         SpaceDistError, match=r"cartpole: of 2 settings that were tried none finished .* a shorter --seconds"

@@ -302,20 +302,22 @@ def fastest(
 
     Raises SpaceDistError if that is so of all. way_out: what its sentence advises beside less work for the machine.
     """
-    rates = {contender: measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"] for contender in contenders}
-    for contender, rate in rates.items():
-        console.print(
-            f"search, {task}: {contender.title}, {contender.setting}: {in_words(rate)}",
-            style="dim",
-            markup=False,
-            soft_wrap=True,
-        )
+    rates = {}
+    for contender in contenders:
+        tried = f"search, {task}: {contender.title}, {contender.setting}"
+        _note(f"{tried}: is tried, for {PATIENCE:.0f} s at most")
+        rates[contender] = measured(task, contender, seconds / 2.0, patience=PATIENCE)["rate"]
+        _note(f"{tried}: {in_words(rates[contender])}")
     if not any(rates.values()):
         raise SpaceDistError(
             f"{task}: of {len(rates)} settings that were tried none finished within {PATIENCE:.0f} s, its start "
             f"and warm-up included; give the machine less else to do, {way_out}"
         )
     return max(rates, key=lambda contender: rates[contender])
+
+
+def _note(text: str) -> None:
+    console.print(text, style="dim", markup=False, soft_wrap=True)
 
 
 def _waits(contender: Contender, costs: dict[str, float]) -> dict[str, float]:
