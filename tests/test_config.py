@@ -514,6 +514,7 @@ def test_what_somebody_elses_code_takes_is_said_to_stand_in_kwargs() -> None:
         ("http://head:8265", " (a job server has http://HOST:PORT, which `grid submit --address` takes)"),
         ("HTTPS://head", " (a job server has http://HOST:PORT, which `grid submit --address` takes)"),
         ("loacl", " (did you mean 'local'?)"), ("head", ""), ("head:abc", ""), (":6379", ""), ("head:99999", ""),
+        ("foo:bar:baz", ""), ("ray://head", ""), ("ray://head:abc", ""),
     ],
 )  # fmt: skip
 def test_an_address_that_no_ray_has_is_refused(address: str, hint: str) -> None:

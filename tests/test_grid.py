@@ -501,6 +501,34 @@ def test_following_a_run_ends_when_nobody_works_any_more(
     assert f"going on with it: `space-dist grid run {grid.folder}`" in said
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("grid", "run", "GRID", "--address", "foo:bar:baz"),
+         "--address must be local, auto, HOST:PORT or ray://HOST:PORT, not 'foo:bar:baz'"),
+        (("grid", "run", "GRID", "--address", "http://x"),
+         "--address must be local, auto, HOST:PORT or ray://HOST:PORT (a job server has http://HOST:PORT, which "
+         "`grid submit --address` takes), not 'http://x'"),
+        (("tune", "run", "GRID", "--address", "atuo"),
+         "--address must be local, auto, HOST:PORT or ray://HOST:PORT (did you mean 'auto'?), not 'atuo'"),
+        *(((*named, "GRID", "--address", "head:8265"),
+           "--address 'head:8265' is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
+          for named in (("grid", "submit"), ("grid", "status"), ("grid", "stop"))),
+    ],
+)  # fmt: skip
+def test_a_wrong_address_is_refused_before_anything_is_printed_or_written(
+    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    path = write_grid(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    named = [str(path) if one == "GRID" else one for one in arguments]
+    assert command(monkeypatch, *named, "--root", tmp_path / "runs") == 2
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", f"space-dist: {said}\n")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_the_log_of_a_run_that_ends_by_episodes_ends_with_these(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

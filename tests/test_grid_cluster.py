@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from space_dist.api.tuning import run_search
-from space_dist.errors import ConfigError, SpaceDistError
+from space_dist.errors import SpaceDistError
 from space_dist.experiment.manifest import Grid, Run
 from space_dist.experiment.status import Attempts
 from space_dist.grid.planning import plan
@@ -203,12 +203,17 @@ def test_a_job_server_that_wants_another_token_is_one_clear_sentence(
         jobs.Remote("http://127.0.0.1:9", manifest, tmp_path / "runs")
 
 
-def test_an_address_that_is_no_urls_is_refused_at_once(tmp_path: Path) -> None:
-    from space_dist.grid.jobs import Remote
+def test_a_job_server_whose_name_nobody_knows_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from space_dist.grid import jobs
 
+    def lost(_: str) -> None:
+        raise ConnectionError("Failed to connect to Ray at address: http://nohost.invalid:8265.")
+
+    monkeypatch.setattr(jobs, "JobSubmissionClient", lost)
     manifest = plan(write_grid(tmp_path), tmp_path / "runs").manifest
-    with pytest.raises(ConfigError, match="'head:8265' is no job server: http://HOST:PORT"):
-        Remote("head:8265", manifest, tmp_path / "runs")
+    with pytest.raises(SpaceDistError, match=r"reached: the name 'nohost\.invalid' cannot be resolved \(.+\)") as told:
+        jobs.Remote("http://nohost.invalid:8265", manifest, tmp_path / "runs")
+    assert "ray start" not in str(told.value)
 
 
 def test_a_place_has_its_share_of_the_memory_of_the_poorest_node(

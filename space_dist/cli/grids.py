@@ -28,6 +28,7 @@ from space_dist.cli.terminal import STOP, Changes, Json, console, delivered, one
 from space_dist.errors import ConfigError, Interrupted, LedgerError, SpaceDistError, counted
 from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile
+from space_dist.system.ray_address import of_a_job_server, of_a_ray
 
 if TYPE_CHECKING:
     from ray.job_submission import JobDetails
@@ -59,7 +60,12 @@ MaxParallel = Annotated[
     Optional[int],  # noqa: UP045
     typer.Option(min=1, max=10_000, help="Runs at a time. Default: as many as there are CPUs for."),
 ]
-Address = Annotated[str, typer.Option(help="local: this machine; auto: the Ray cluster this process is in.")]
+Address = Annotated[
+    str,
+    typer.Option(
+        help="local: this machine; auto: the Ray cluster this process is in; HOST:PORT: that one.", callback=of_a_ray
+    ),
+]
 ClusterMode = Annotated[
     str,
     typer.Option(
@@ -78,7 +84,7 @@ StopFile = Annotated[
 ]
 JobServer = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option(help="The cluster's job server, where its storage is not seen from here."),
+    typer.Option(help="The cluster's job server, where its storage is not seen from here.", callback=of_a_job_server),
 ]
 Seed = Annotated[
     Optional[int],  # noqa: UP045
@@ -192,7 +198,7 @@ def grid_run(
 @grid_app.command("submit")
 def grid_submit(
     grid: GridPath,
-    address: Annotated[str, typer.Option(help="The cluster's job server, like http://127.0.0.1:8265.")],
+    address: Annotated[str, typer.Option(help="Its job server, like http://127.0.0.1:8265.", callback=of_a_job_server)],
     root: Root = None,
     scale: Scale = 1.0,
     changes: Changes = None,

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from space_dist.config.tracking_uri import AUTO, checked_uri
 from space_dist.config.wanted import Words
-from space_dist.errors import nearest
+from space_dist.system import ray_address
 from space_dist.system.importing import why_refused
 
 MAX_LIST = 10_000  # values of a list in a config
@@ -151,7 +151,6 @@ class EvaluationConfig(Section):
         return value
 
 
-_ADDRESSES = ("local", "auto")  # of a Ray, beside HOST:PORT
 _USUAL_ROUNDS = 20  # between checkpoints
 _WORTH = 0.01  # of a run's time
 
@@ -252,18 +251,8 @@ class ResourcesConfig(Patience):
     @field_validator("address")
     @classmethod
     def _of_a_ray(cls, value: str) -> str:
-        scheme, has_scheme, _ = value.partition("://")
-        host, _, port = value.rpartition(":")
-        if has_scheme:
-            # Others than ray:// are for packages that extend Ray; it is asked when the run begins.
-            known = scheme.lower() not in ("http", "https")
-            hint = "" if known else " (a job server has http://HOST:PORT, which `grid submit --address` takes)"
-        else:
-            known = value in _ADDRESSES or (bool(host) and port.isdecimal() and 0 < int(port) < 65536)
-            near = nearest(value, _ADDRESSES).strip("; ").removesuffix(".")
-            hint = f" ({near})" if near and ":" not in value else ""
-        if not known:
-            raise ValueError(f"must be local, auto, HOST:PORT or ray://HOST:PORT{hint}")
+        if must := ray_address.fault(value):
+            raise ValueError(must)
         return value
 
 

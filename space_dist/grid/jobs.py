@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 from space_dist.system.workplace import RAY_DEFAULTS, cores
 
@@ -31,7 +32,7 @@ import requests
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobDetails, JobStatus, JobSubmissionClient
 
-from space_dist.errors import ConfigError, Interrupted, SpaceDistError
+from space_dist.errors import Interrupted, SpaceDistError
 from space_dist.experiment.endings import Busy, Ended, Evidence
 from space_dist.experiment.manifest import Grid, Manifest, Run
 from space_dist.experiment.status import Attempts, RunStatus, settled
@@ -41,6 +42,7 @@ from space_dist.grid.supervisor import AttemptId, ray_answers
 from space_dist.grid.warm import slurms_memory_of_a_core
 from space_dist.run.ray_session import attended, join_ray, remove_session
 from space_dist.system.importing import PYTHON
+from space_dist.system.ray_address import unresolved
 
 log = logging.getLogger("space_dist")
 
@@ -413,8 +415,6 @@ def _while_away(address: str) -> Iterator[None]:
 
 
 def _client(address: str) -> JobSubmissionClient:
-    if not address.startswith(("http://", "https://")):  # Ray would try it as that of the cluster itself, for a minute
-        raise ConfigError(f"--address {address!r} is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
     try:
         return JobSubmissionClient(address)
     except AuthenticationError as error:
@@ -423,6 +423,8 @@ def _client(address: str) -> JobSubmissionClient:
             f"have that token in ~/.ray/auth_token ({_first(error)})"
         ) from error
     except (ConnectionError, RuntimeError, ValueError, requests.RequestException) as error:
+        if (host := urlsplit(address).hostname) and (unknown := unresolved(host)):
+            raise SpaceDistError(f"Ray's job server at {address} cannot be reached: {unknown}") from error
         raise SpaceDistError(
             f"Ray's job server at {address} does not answer: {_first(error)}. `ray start --head` on that machine "
             "starts one (--dashboard-host=0.0.0.0 where it is another than this); `space-dist grid run` needs none"

@@ -22,6 +22,7 @@ from typing import Literal
 import psutil
 
 from space_dist.errors import CONTINUES, Interrupted, SpaceDistError
+from space_dist.system.ray_address import split, unresolved
 
 REACH_SECONDS = 30.0  # to get an answer from an address, before Ray is asked to join it
 JOIN_SECONDS = 300.0  # for `ray.init` to join: more than it takes on a busy machine, less than its own 824 s
@@ -72,16 +73,15 @@ def reach(address: str, raise_if_stopped: Callable[[], None]) -> None:
             "that is the address of a job server, which `grid submit --address` takes; this one is HOST:PORT, "
             "ray://HOST:PORT or auto"
         )
-    target = address.rpartition("://")[2]
-    host, _, port = target.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+    target, host_and_port = address.rpartition("://")[2], split(address)
+    if host_and_port is None:
         return
     until = time.monotonic() + REACH_SECONDS
     while (found := asked(target, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
         raise_if_stopped()
         if time.monotonic() > until:
             what = NOBODY_LISTENS if found == "gone" else "what listens there does not answer"
-            raise SpaceDistError(f"{what}, for {REACH_SECONDS:.0f} s")
+            raise SpaceDistError(unresolved(host_and_port[0]) or f"{what}, for {REACH_SECONDS:.0f} s")
         time.sleep(0.2)
 
 

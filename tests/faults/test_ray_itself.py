@@ -57,6 +57,10 @@ def test_an_address_that_nobody_answers_at_is_told(mute: str, monkeypatch: pytes
             reach(address, lambda: heeded.append(1))
         with pytest.raises(SpaceDistError, match=said):
             reach(f"ray://{address}", lambda: None)
+    with pytest.raises(
+        SpaceDistError, match=r"^the name 'nohost\.invalid' cannot be resolved \(.+\); is it spelt right"
+    ):
+        reach("nohost.invalid:6379", lambda: None)
     assert heeded
     reach("auto", lambda: None)  # Ray's to find
 

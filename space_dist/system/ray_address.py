@@ -1,0 +1,59 @@
+"""How a Ray, or its job server, is addressed: what can be told of an address before Ray itself is imported."""
+
+from __future__ import annotations
+
+import socket
+from typing import Final
+
+from space_dist.errors import ConfigError, nearest
+
+JOB_SERVER: Final = ("http://", "https://")
+_NAMES: Final = ("local", "auto")  # of a Ray, beside HOST:PORT
+_ALLOWED: Final = "local, auto, HOST:PORT or ray://HOST:PORT"
+
+
+def split(address: str) -> tuple[str, int] | None:
+    """Host and port of HOST:PORT, with or without a scheme; None of anything else."""
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        return None
+    return host.strip("[]"), int(port)
+
+
+def fault(address: str) -> str | None:
+    """What an address of a Ray must be, if this is none."""
+    scheme, has_scheme, _ = address.partition("://")
+    if has_scheme:
+        # Others than ray:// are for packages that extend Ray; it is asked when the run begins.
+        of_jobs = scheme.lower() in ("http", "https")
+        known = not of_jobs and (scheme.lower() != "ray" or split(address) is not None)
+        hint = " (a job server has http://HOST:PORT, which `grid submit --address` takes)" if of_jobs else ""
+    else:
+        known = address in _NAMES or split(address) is not None
+        near = nearest(address, _NAMES).strip("; ").removesuffix(".")
+        hint = f" ({near})" if near and ":" not in address else ""
+    return None if known else f"must be {_ALLOWED}{hint}"
+
+
+def of_a_ray(address: str) -> str:
+    """What `--address` was given. Raises ConfigError if no Ray has such an address."""
+    if must := fault(address):
+        raise ConfigError(f"--address {must}, not {address[:100]!r}")
+    return address
+
+
+def of_a_job_server(address: str | None) -> str | None:
+    """The same for a job server's. Ray would try another as that of the cluster itself, for a minute."""
+    if address is not None and not address.startswith(JOB_SERVER):
+        raise ConfigError(f"--address {address[:100]!r} is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
+    return address
+
+
+def unresolved(host: str) -> str | None:
+    """That a host's name is not known here, if so: a clause of a sentence about its address."""
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or "it is no host's name"
+        return f"the name {host!r} cannot be resolved ({why}); is it spelt right, and known to this machine?"
+    return None
