@@ -9,6 +9,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -499,6 +500,33 @@ def test_following_a_run_ends_when_nobody_works_any_more(
     said = capsys.readouterr().err
     assert said.count("nobody works on the grid any more") == 2
     assert f"going on with it: `space-dist grid run {grid.folder}`" in said
+
+
+def test_what_an_earlier_attempt_has_printed_does_not_pass_for_the_last_ones(
+    one: tuple[Grid, Manifest, Run], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid, _, run = one
+    ledger = grid.ledger(run)
+    Attempts(ledger).begin(1, {})
+    output = ledger.folder / "output.txt"
+    output.write_text("Traceback of the first\n")
+    ledger.log.write_text("log of both\n")
+    os.utime(output, (before := time.time() - 60.0, before))
+    logs = ("grid", "logs", grid.folder, "kappa=1", "--seed", run.seed)
+    assert command(monkeypatch, *logs) == 0
+    assert capsys.readouterr().out == "log of both\nTraceback of the first\n"  # as long as there is no other
+    Attempts(ledger).begin(2, {})
+    assert command(monkeypatch, *logs) == 0
+    said = capsys.readouterr()
+    assert said.out == "log of both\n"
+    assert f"what an earlier attempt printed beside its log is in {output}\n" in said.err
+    with output.open("a") as file:
+        file.write("Traceback of the second\n")
+    os.utime(output, (after := time.time() + 1.0, after))
+    assert command(monkeypatch, *logs) == 0
+    said = capsys.readouterr()
+    assert said.out == "log of both\nTraceback of the first\nTraceback of the second\n"
+    assert "earlier attempt" not in said.err
 
 
 @pytest.mark.parametrize(

@@ -294,25 +294,24 @@ def grid_logs(
     ] = False,
 ) -> None:
     """What one run has said."""
-    from space_dist.grid.supervisor import OUTPUT
+    from space_dist.cli.logs import RunLog
     from space_dist.slurm.queue import WatchedQueue
 
     place, manifest = _found(grid, root)
     run = manifest.run(cell, seed)
     ledger = place.ledger(run)
-    offsets = {ledger.log: 0, ledger.folder / OUTPUT: 0}
     [run_status] = run_statuses_of(place, manifest, [run])
-    watched, watching = WatchedQueue(place.folder), Watching(begun=run_status.attempts > 0)
+    watched, watching, log = WatchedQueue(place.folder), Watching(begun=run_status.attempts > 0), RunLog(ledger)
     while True:
         [run_status] = run_statuses_of(place, manifest, [run])
-        for path in offsets:
-            offsets[path] = _print_from(path, offsets[path])
+        log.show()
         if not follow or output_left() or run_status.condition in ("done", "failed"):
             break
         if watching.is_over(place, watched.now(), [run_status]):
             warn("nobody works on the grid any more")
             break
         time.sleep(_WATCH_SECONDS)
+    log.tell_left_out()
     taken = f"{run_status.steps:,} of {run_status.budget_steps:,} steps"
     if (limit := run.cell.episodes_to_take) is not None:
         taken += f", {episodes_of(ledger):,} of {limit:,} episodes"
@@ -591,14 +590,3 @@ def print_json(data: dict[str, Any]) -> None:
     """What a command was asked for as JSON. Raises SpaceDistError if it is lost."""
     print(json.dumps(data, indent=1))
     delivered()
-
-
-def _print_from(path: Path, offset: int) -> int:
-    """Print what a growing file holds from `offset` on; returns its new end."""
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        file.seek(offset)
-        text = file.read()
-        if text:
-            print(text.decode(errors="replace"), end="", flush=True)
-        return offset + len(text)
-    return offset

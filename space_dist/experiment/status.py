@@ -112,6 +112,10 @@ class Attempts:
             return self.path.stat().st_mtime
         return 0.0
 
+    def begun_at(self) -> list[float]:
+        """When each attempt began, in seconds since the epoch."""
+        return [float(row["unix_time"]) for row in self.rows() if row.get("event") == "begin"]
+
     def history(self) -> History:
         """What the rows say."""
         begun, last, where, process = 0, None, dict[str, Any](), dict[str, Any]()
