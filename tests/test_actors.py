@@ -162,7 +162,7 @@ def test_the_ray_that_auto_took_is_named(tmp_path: Path) -> None:
         manifest = plan(write_grid(tmp_path), tmp_path / "runs").manifest
         with _joined(address, manifest, 1, lambda: None, said.append):
             pass
-    assert said == [f"{manifest.name}: on the Ray at {one} (auto)"]
+    assert said == [f"{manifest.name}: joined the Ray at {one} (auto)"]
 
 
 @pytest.mark.parametrize(("fault", "ends"), [("exit", "failed"), ("_exit", "done")])

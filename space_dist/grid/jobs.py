@@ -100,8 +100,9 @@ def _joined(
             raise Interrupted(f"stopped before Ray was started ({reason})")
 
     def joined(which: str) -> None:
-        log.info("joined the Ray at %s", which)
-        say(f"{manifest.name}: on the Ray at {which}")
+        sentence = f"joined the Ray at {which}"
+        log.info("%s", sentence)
+        say(f"{manifest.name}: {sentence}")
 
     # A run with rollout actors may have more processes than this machine has cores; they share them.
     most = max(cores(), (max_parallel or 1) * manifest.cpus_per_run)
