@@ -512,18 +512,20 @@ def test_what_somebody_elses_code_takes_is_said_to_stand_in_kwargs() -> None:
     ("address", "hint"),
     [
         ("http://head:8265", " (a job server has http://HOST:PORT, which `grid submit --address` takes)"),
-        ("HTTPS://head", " (a job server has http://HOST:PORT, which `grid submit --address` takes)"),
+        ("HTTPS://head", " (a job server has https://HOST:PORT, which `grid submit --address` takes)"),
         ("loacl", " (did you mean 'local'?)"), ("head", ""), ("head:abc", ""), (":6379", ""), ("head:99999", ""),
-        ("foo:bar:baz", ""), ("ray://head", ""), ("ray://head:abc", ""),
+        ("foo:bar:baz", ""), ("anyscale://x", ""),
+        ("ray://head:10001",
+         " (ray:// is a Ray client's; a run is started on a machine of the cluster, or by `grid submit`)"),
     ],
 )  # fmt: skip
 def test_an_address_that_no_ray_has_is_refused(address: str, hint: str) -> None:
     override = f"resources.address={address}"
-    said = f"resources.address: must be local, auto, HOST:PORT or ray://HOST:PORT{hint}, not {address!r}"
+    said = f"resources.address: must be local, auto or HOST:PORT{hint}, not {address!r}"
     assert refusal(SPACE, override) == f"--set {override}: {said}"
 
 
-@pytest.mark.parametrize("address", ["local", "auto", "head:6379", "10.0.0.1:6379", "'[::1]:6379'", "ray://head:10001"])
+@pytest.mark.parametrize("address", ["local", "auto", "head:6379", "10.0.0.1:6379", "'[::1]:6379'"])
 def test_addresses_of_rays_are_taken(address: str) -> None:
     assert load(SPACE, [f"resources.address={address}"]).resources.address == address.strip("'")
 

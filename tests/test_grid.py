@@ -533,12 +533,12 @@ def test_what_an_earlier_attempt_has_printed_does_not_pass_for_the_last_ones(
     ("arguments", "said"),
     [
         (("grid", "run", "GRID", "--address", "foo:bar:baz"),
-         "--address must be local, auto, HOST:PORT or ray://HOST:PORT, not 'foo:bar:baz'"),
+         "--address must be local, auto or HOST:PORT, not 'foo:bar:baz'"),
         (("grid", "run", "GRID", "--address", "http://x"),
-         "--address must be local, auto, HOST:PORT or ray://HOST:PORT (a job server has http://HOST:PORT, which "
+         "--address must be local, auto or HOST:PORT (a job server has http://HOST:PORT, which "
          "`grid submit --address` takes), not 'http://x'"),
         (("tune", "run", "GRID", "--address", "atuo"),
-         "--address must be local, auto, HOST:PORT or ray://HOST:PORT (did you mean 'auto'?), not 'atuo'"),
+         "--address must be local, auto or HOST:PORT (did you mean 'auto'?), not 'atuo'"),
         *(((*named, "GRID", "--address", "head:8265"),
            "--address 'head:8265' is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
           for named in (("grid", "submit"), ("grid", "status"), ("grid", "stop"))),

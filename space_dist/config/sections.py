@@ -237,7 +237,7 @@ class ResourcesConfig(Patience):
     100,000 steps or more; else 0, as actors would gain nothing. In a cluster: one for each of its CPUs and shard at
     most."""
     address: str = Field(default="local", min_length=1, max_length=300)
-    """local: a private Ray on this machine; auto, HOST:PORT or ray://HOST:PORT: join that cluster."""
+    """local: a private Ray on this machine; auto or HOST:PORT: join that cluster."""
     grace_seconds: float = Field(default=25.0, gt=0.0)
     """After a signal, the time to reach a checkpoint; then the run ends on the last one. Both exit with 75."""
 

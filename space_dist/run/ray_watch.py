@@ -22,7 +22,7 @@ from typing import Literal
 import psutil
 
 from space_dist.errors import CONTINUES, Interrupted, SpaceDistError
-from space_dist.system.ray_address import split, unresolved
+from space_dist.system.ray_address import fault, split, unresolved
 
 REACH_SECONDS = 30.0  # to get an answer from an address, before Ray is asked to join it
 JOIN_SECONDS = 300.0  # for `ray.init` to join: more than it takes on a busy machine, less than its own 824 s
@@ -68,16 +68,13 @@ def asked(address: str, seconds: float = _ASK_SECONDS) -> Literal["answers", "si
 
 def reach(address: str, raise_if_stopped: Callable[[], None]) -> None:
     """Wait until HOST:PORT answers, for 30 s at most; other addresses are Ray's to find. Raises SpaceDistError."""
-    if address.startswith(("http://", "https://")):
-        raise SpaceDistError(
-            "that is the address of a job server, which `grid submit --address` takes; this one is HOST:PORT, "
-            "ray://HOST:PORT or auto"
-        )
-    target, host_and_port = address.rpartition("://")[2], split(address)
+    if must := fault(address):  # of RAY_ADDRESS, which `auto` stands for where it is set
+        raise SpaceDistError(f"an address {must}, not {address[:100]!r}")
+    host_and_port = split(address)
     if host_and_port is None:
         return
     until = time.monotonic() + REACH_SECONDS
-    while (found := asked(target, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
+    while (found := asked(address, max(0.1, min(_ASK_SECONDS, until - time.monotonic())))) != "answers":
         raise_if_stopped()
         if time.monotonic() > until:
             what = NOBODY_LISTENS if found == "gone" else "what listens there does not answer"

@@ -9,7 +9,13 @@ from space_dist.errors import ConfigError, nearest
 
 JOB_SERVER: Final = ("http://", "https://")
 _NAMES: Final = ("local", "auto")  # of a Ray, beside HOST:PORT
-_ALLOWED: Final = "local, auto, HOST:PORT or ray://HOST:PORT"
+_ALLOWED: Final = "local, auto or HOST:PORT"
+_SCHEMES: Final = {
+    "http": "a job server has http://HOST:PORT, which `grid submit --address` takes",
+    "https": "a job server has https://HOST:PORT, which `grid submit --address` takes",
+    "ray": "ray:// is a Ray client's; a run is started on a machine of the cluster, or by `grid submit`",
+}
+"""Of addresses that Ray knows and no run can join, what they are."""
 
 
 def split(address: str) -> tuple[str, int] | None:
@@ -24,15 +30,12 @@ def fault(address: str) -> str | None:
     """What an address of a Ray must be, if this is none."""
     scheme, has_scheme, _ = address.partition("://")
     if has_scheme:
-        # Others than ray:// are for packages that extend Ray; it is asked when the run begins.
-        of_jobs = scheme.lower() in ("http", "https")
-        known = not of_jobs and (scheme.lower() != "ray" or split(address) is not None)
-        hint = " (a job server has http://HOST:PORT, which `grid submit --address` takes)" if of_jobs else ""
+        hint = _SCHEMES.get(scheme.lower(), "")
+    elif address in _NAMES or split(address) is not None:
+        return None
     else:
-        known = address in _NAMES or split(address) is not None
-        near = nearest(address, _NAMES).strip("; ").removesuffix(".")
-        hint = f" ({near})" if near and ":" not in address else ""
-    return None if known else f"must be {_ALLOWED}{hint}"
+        hint = nearest(address, _NAMES).strip("; ").removesuffix(".") if ":" not in address else ""
+    return f"must be {_ALLOWED}" + (f" ({hint})" if hint else "")
 
 
 def of_a_ray(address: str) -> str:
