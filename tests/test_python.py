@@ -314,7 +314,8 @@ def test_a_config_is_a_path_a_mapping_or_itself(tmp_path: Path, monkeypatch: pyt
     assert as_config(data).instances.train == tmp_path / "here.csv"
     assert data["instances"]["train"] == "here.csv"
     for bad, words in (
-        (7, "a path, a mapping or a RunConfig, not a int"),
+        (7, "a path, shipped:NAME, a mapping or a RunConfig, not a int"),
+        ("", "a config is a path, shipped:NAME, a mapping or a RunConfig, not ''"),
         ({**data, "nmae": "x"}, "config: nmae: unknown key; did you mean 'name'?"),
         ({**data, "learner": {"kind": "ppo", "n_steps": object()}}, "learner.n_steps"),
     ):

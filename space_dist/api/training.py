@@ -176,7 +176,7 @@ def as_config(
     config: Config, overrides: Overrides = (), *, seed: int | None = None, workers: int | None = None
 ) -> RunConfig:
     """A checked config from whatever names or holds one. Raises ConfigError with the key of every fault."""
-    if isinstance(config, str | Path):
+    if isinstance(config, str | Path) and str(config):
         data, source = configs.read(Path(config)), str(config)
     elif isinstance(config, RunConfig):
         data, source = config.model_dump(mode="json"), _SOURCE
@@ -184,7 +184,8 @@ def as_config(
         data, source = configs.plain(without_numpy(config), _SOURCE), _SOURCE
         configs.from_its_folder(data, Path.cwd())
     else:
-        raise ConfigError(f"a config is a path, a mapping or a RunConfig, not a {type(config).__name__}")
+        what = "''" if config == "" else f"a {type(config).__name__}"
+        raise ConfigError(f"a config is a path, shipped:NAME, a mapping or a RunConfig, not {what}")
     changes = as_changes(overrides)
     for change in changes:
         configs.apply_override(data, change)
