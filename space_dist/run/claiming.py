@@ -6,10 +6,12 @@ import contextlib
 import functools
 import itertools
 import logging
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 from space_dist import arithmetic
 from space_dist import config as configs
@@ -26,6 +28,8 @@ from space_dist.system.provenance import fingerprint
 
 log = logging.getLogger("space_dist")
 
+_ANEW: Final = "beginning anew: no checkpoint had been written"
+
 
 def claim(
     blueprint: Blueprint, setup: Setup, writer: RunWriter, stop: StopRequests, pause_at: int
@@ -40,7 +44,9 @@ def claim(
         identity=configs.identity(config, setup.train.digest(), setup.test.digest(), given=given),
     )  # fmt: skip
     before, earlier, goes_on, damage = None, None, "", list[str]()
-    if not is_stillborn(ledger):
+    if is_stillborn(ledger) and ledger.status().identity != status.identity:
+        goes_on = _ANEW
+    else:
         before = writer.status = _status_before(ledger)
         earlier = _refuse_other_run(config, setup, given, ledger, status.identity, before)
     if before is not None:
@@ -102,7 +108,7 @@ def _where_it_goes_on(ledger: Ledger, before: Status) -> str:
     """`going on at 18,432 steps`, of a run nothing of which is damaged; empty where that shows once it is restored."""
     newest = next(iter(ledger.checkpoint_files()), None)
     if newest is None:
-        return "" if before.checkpoint else "beginning anew: no checkpoint had been written"
+        return "" if before.checkpoint else _ANEW
     # A run may have been killed between a checkpoint and the status that names it.
     return f"going on at {before.steps:,} steps" if newest.name == before.checkpoint else ""
 
@@ -161,14 +167,18 @@ def arithmetic_digest() -> str:
 
 
 def is_stillborn(ledger: Ledger) -> bool:
-    """Whether a run failed there within its first iteration, as by a fault of its learner, and has no checkpoint.
+    """Whether a run ended there before anything came of it, and nothing is lost if one of another config takes over.
 
-    Nothing is lost if one of another config takes its place.
+    It has no checkpoint, and failed within its first iteration, as by a fault of its learner, or was stopped or killed
+    before its first round. One that began anew, without its checkpoints, still has rows, or the model of its first end.
     """
     with contextlib.suppress(LedgerError):
         status = ledger.status()
-        if status.state == "failed" and status.checkpoint is None and not ledger.checkpoint_files():
-            return not any(row["kind"] == "iteration" for row in ledger.rows())
+        models = (ledger.model_arrays, ledger.model_description)
+        if status.checkpoint is not None or ledger.checkpoint_files() or any(path.exists() for path in models):
+            return False
+        first = 0 if status.state != "failed" else math.inf  # the round up to which its evaluations are no results
+        return not any(row["kind"] == "iteration" or row.get("round", 0) > first for row in ledger.rows())
     return False
 
 

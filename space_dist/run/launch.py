@@ -89,8 +89,8 @@ def launch(
 
     pause_at: environment steps at which it is paused, behind the first update that is made then, to be gone on with by
     another launch; 0: nowhere. observe: told of progress. waiting: told what is waited for, before and behind that:
-    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too. going_on: with `resume`,
-    told where a run goes on that was there, `going on at 18,432 steps`, and that one begins where none was.
+    `starting Ray`. tell: told what is worth a line of its own, which stands in the log, too. going_on: told
+    where a run goes on that was there, `going on at 18,432 steps`; with `resume`, that one begins where none was.
 
     With `resume`, a run that is there is continued, and one that is not is started. Raises ConfigError if the folder
     holds another run, RunLockedError if somebody else works on it, Interrupted if asked to stop, and any other
@@ -215,7 +215,8 @@ def _begun(
     # Whatever the config cannot do is refused before the folder is written to.
     setup = blueprint.setup(*blueprint.instances())
     blueprint.refuse_machine()
-    if ledger.exists() and not resume and not is_stillborn(ledger):
+    # What was just begun looks stillborn, and is somebody's.
+    if ledger.exists() and not resume and (ledger.owner_alive() or not is_stillborn(ledger)):
         raise ConfigError(already_there(config, ledger))
     with RunWriter(ledger) as writer:
         status, goes_on = claim(blueprint, setup, writer, stop, pause_at)
