@@ -643,7 +643,7 @@ def test_progress_shows_the_last_evaluation_at_the_end_and_after_resuming(
 ) -> None:
     def returns(evaluation: int) -> str:
         row = [row for row in Ledger(tmp_path / "run").rows() if row["kind"] == "evaluation"][evaluation]
-        return f"return train {row['train']['return']:.2f} test {row['test']['return']:.2f}"
+        return f"return train {row['train']['return']:.2f} test {row['test']['return']:.2f} at {row['steps']:,}"
 
     settings = [part for setting in SMALL for part in ("--set", setting)]
     command = ["train", CONFIG, *settings, "--set", "evaluation.every_steps=4096", "--out", tmp_path / "run"]
@@ -658,15 +658,17 @@ def test_progress_shows_the_last_evaluation_at_the_end_and_after_resuming(
 
 
 @pytest.mark.parametrize(("width", "line"), [
-    (None, "491,520/1,000,000 steps  12,097/s  1:04:23 left  set 33/100  return train -7.56 test 18.11"),
-    (80, "491,520/1,000,000 steps  12,097/s  1:04:23 left  return train -7.56 test 18.11"),
-    (61, "491,520/1,000,000  12,097/s  1:04:23  train -7.56 test 18.11"),  # of 80, behind `pointmass_space s0`
+    (None, "491,520/1,000,000 steps  12,097/s  1:04:23 left  set 33/100  return train -7.56 test 18.11 at 490,000"),
+    (89, "491,520/1,000,000 steps  12,097/s  1:04:23 left  return train -7.56 test 18.11 at 490,000"),
+    (81, "491,520/1,000,000  12,097/s  1:04:23 left  train -7.56 test 18.11 at 490,000"),  # of 100
+    (61, "491,520/1,000,000  1:04:23  train -7.56 test 18.11 at 490,000"),  # of 80, behind `pointmass_space s0`
     (55, "491,520/1,000,000  1:04:23 left  train -7.56 test 18.11"),
     (9, "491,520/1,000,000  1:04:23 left  train -7.56 test 18.11"),
 ])  # fmt: skip
 def test_a_narrow_terminal_shows_the_returns(width: int | None, line: str) -> None:
     progress = Progress(
-        491_520, 1_000_000, 12_097.0, 33, 100, train_return=-7.56, test_return=18.11, seconds_left=3863.0
+        491_520, 1_000_000, 12_097.0, 33, 100, train_return=-7.56, test_return=18.11, seconds_left=3863.0,
+        evaluated_at=490_000,
     )  # fmt: skip
     assert runs.in_words(progress, width) == line
 

@@ -109,11 +109,10 @@ def shown(wanted: bool) -> Iterator[Callable[[str], None]]:
 
 
 def line_of_run(name: str, seed: int, progress: Progress) -> str:
-    """`pointmass_space s0  12,288/100,000 steps (12 %)  5,012/s  set 4/100  return train 1.20 test 1.10`."""
+    """`pointmass_space s0  12,288/100,000 steps (12%)  5,012/s  set 4/100  return train 1.20 test 1.10 at 10,240`."""
     return (
         f"{name} s{seed}  {progress.so_far} ({progress.share:.0%})  "
-        f"{progress.pace}  set {progress.trained}  "
-        f"return train {_number(progress.train_return)} test {_number(progress.test_return)}"
+        f"{progress.pace}  set {progress.trained}  return {progress.returns}"
     )
 
 
@@ -124,7 +123,3 @@ def line_of_grid(name: str, overview: Overview) -> str:
         f"{overview.waiting} waiting, {overview.failed} failed"
     )
     return f"{line} (last: {overview.message})" if overview.message else line
-
-
-def _number(value: float | None) -> str:
-    return "—" if value is None else f"{value:.2f}"

@@ -30,7 +30,7 @@ _GRID_WIDTH = 150
 _MAX_CELLS_SHOWN = 60
 _MAX_NAMED = 5  # folders in a line
 _BAR_WIDTH = 20
-_LINE_WIDTH = 100  # beside a bar
+_LINE_WIDTH = 114  # beside a bar
 _LINE_SECONDS = 10.0  # between lines of progress
 
 
@@ -426,13 +426,9 @@ def _lines(title: str) -> tuple[Callable[[Progress], None], Callable[[str], None
 
 def in_words(progress: Progress, width: int | None = None) -> str:
     """How far a run is, in so many characters if that can be: what matters least is left out, first of all."""
-
-    def number(value: float | None) -> str:
-        return "—" if value is None else f"{value:.2f}"
-
     seconds = progress.seconds_left
     left = "" if seconds is None else f"{datetime.timedelta(seconds=round(seconds))} left"
-    returns = f"train {number(progress.train_return)} test {number(progress.test_return)}"
+    returns = progress.returns
     done, steps = [progress.so_far, progress.pace, left], progress.so_far.removesuffix(" steps")
     lines = (
         [*done, f"set {progress.trained}", f"return {returns}"],
@@ -441,6 +437,8 @@ def in_words(progress: Progress, width: int | None = None) -> str:
         [steps, progress.pace, left, returns],
         [steps, progress.pace, left.removesuffix(" left"), returns],
         [steps, left or progress.pace, returns],
+        [steps, left.removesuffix(" left") or progress.pace, returns],
+        [steps, left or progress.pace, returns.partition(" at ")[0]],
     )
     for parts in lines:
         line = "  ".join(filter(None, parts))

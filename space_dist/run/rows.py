@@ -32,6 +32,12 @@ def trained_row(run: RunState, selection: Selection, train: InstanceSet) -> Row:
     return {"iteration": run.iteration, "steps": run.steps, **trained}
 
 
+def size_of(trained: Row) -> int:
+    """How many instances an iteration was trained on, by its `trained_row`; generated contexts count each."""
+    ids = trained["trained"]
+    return len(ids) if GENERATED in ids else len(set(ids))
+
+
 def iteration_row(run: RunState, *, complete: bool, overlap: bool) -> Row:
     """One iteration in numbers: means over its episodes, and over its updates.
 

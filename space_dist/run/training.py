@@ -56,7 +56,7 @@ from space_dist.run.building import Blueprint, load_learner, model_of
 from space_dist.run.cluster import Cluster, Decision, Evidence, Handle, checked
 from space_dist.run.pace import TimeLeft
 from space_dist.run.requests import Learn, Wait, Work
-from space_dist.run.rows import iteration_row, next_evaluation, position, summary, trained_row
+from space_dist.run.rows import iteration_row, next_evaluation, position, size_of, summary, trained_row
 from space_dist.run.starting import start_from
 from space_dist.run.state import RunState
 
@@ -71,9 +71,10 @@ class Progress:
     """What a display shows, and a function that is given as `progress` is called with.
 
     steps, budget_steps: environment steps, and those of the whole updates that fit into the budget.  set_size: how many
-    of `n_instances` are selected.  train_return, test_return: means of the last evaluation; None before the first.
-    episodes, budget_episodes: of training; the latter None where they are not limited.  seconds_left: at the pace of
-    the last minute; None until some rounds have told that.
+    of `n_instances` are trained on; with the last call, were last.  train_return, test_return: means of the last
+    evaluation, made after `evaluated_at` steps; all None before the first.  episodes, budget_episodes: of training; the
+    latter None where they are not limited.  seconds_left: at the pace of the last minute; None until some rounds have
+    told that.
     """
 
     steps: int
@@ -86,6 +87,7 @@ class Progress:
     episodes: int = 0
     budget_episodes: int | None = None
     seconds_left: float | None = None
+    evaluated_at: int | None = None
 
     @property
     def share(self) -> float:
@@ -98,6 +100,13 @@ class Progress:
         """`4,108/20,000 steps`, and `, 40/100 episodes` where these are limited, too."""
         episodes = f", {self.episodes:,}/{self.budget_episodes:,} episodes" if self.budget_episodes else ""
         return f"{self.steps:,}/{self.budget_steps:,} steps{episodes}"
+
+    @property
+    def returns(self) -> str:
+        """`train 1.20 test 1.10 at 10,240`, the steps after which they were measured; dashes before that."""
+        train, test = ("—" if value is None else f"{value:.2f}" for value in (self.train_return, self.test_return))
+        at = "" if self.evaluated_at is None else f" at {self.evaluated_at:,}"
+        return f"train {train} test {test}{at}"
 
     @property
     def trained(self) -> str:
@@ -165,6 +174,7 @@ class Training:
         self._segments: list[Segment] = []  # of the replay buffer, as of the last commit
         self._last_row_time = self._last_commit_time = time.monotonic()
         self._last_row_steps = 0
+        self._last_size: int | None = None  # how many instances the last iteration that ended was trained on
         self._time_left = TimeLeft()
         self._last_commit_round, self._commit_cost = 0, 0.0  # seconds, that the last one took to write
         steps = blueprint.reachable_steps(self._curriculum)
@@ -363,6 +373,7 @@ class Training:
         for row in rows:
             if row["kind"] == "evaluation":
                 self.progress.train_return, self.progress.test_return = row["train"]["return"], row["test"]["return"]
+                self.progress.evaluated_at = row["steps"]
 
     def _rounds_on(self, selection: Selection) -> int:
         """Rounds of an iteration: as many as pass over the selection at full horizon, and one of what is drawn."""
@@ -463,6 +474,8 @@ class Training:
         run = self._run
         yield from self._end_iteration()
         yield from self._settle()
+        if self._last_size is not None:  # what was decided last is never trained on
+            self.progress.set_size = self._last_size
         self._show()  # only now, for the last returns are known
         yield from self._commit("done")
         arrays, description = model_of(self.learner, run.round)
@@ -503,7 +516,9 @@ class Training:
         run, selection = self._run, self._asked.trained
         if selection is None:
             raise RuntimeError("an iteration ended before its selection was known")
-        self._writer.append(CURRICULUM, trained_row(run, selection, self._setup.train))
+        row = trained_row(run, selection, self._setup.train)
+        self._writer.append(CURRICULUM, row)
+        self._last_size = size_of(row)
         return iteration_row(run, complete=complete, overlap=self._config.rollout.overlap)
 
     def _append(self, row: Row) -> None:
