@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from sb3_contrib import ARS, MaskablePPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -291,6 +291,20 @@ def test_evaluating_on_what_is_trained_on_is_refused(wrap: Callable[[ContextVecE
     sentence = "EvalCallback has the env that is being trained on, .*; give EvalCallback a ContextVecEnv of its own$"
     with pytest.raises(ConfigError, match=sentence):
         ppo(wrap(env)).learn(100, callback=callbacks)
+
+
+def test_evaluating_on_an_environment_without_the_context_is_refused() -> None:
+    blind = ContextVecEnv(LINE, TARGETS, 1, context_visible=False)
+    bare = EvalCallback(blind, eval_freq=4, n_eval_episodes=2, verbose=0)
+    sentence = (
+        "^CurriculumCallback: EvalCallback has an env whose observations are of another shape than those that the "
+        "model acts on, which have the context in them; give EvalCallback a ContextVecEnv of its own, wrapped "
+    )
+    for callbacks in ([CurriculumCallback("space"), bare], [CallbackList([bare]), CurriculumCallback("space")]):
+        with pytest.raises(ConfigError, match=sentence):
+            ppo(line_env()).learn(100, callback=callbacks)
+    hidden = ContextVecEnv(LINE, TARGETS, SLOTS, context_visible=False)
+    ppo(hidden).learn(16, callback=[CurriculumCallback("uniform"), bare])
 
 
 def test_evaluating_on_an_environment_of_its_own_changes_nothing() -> None:

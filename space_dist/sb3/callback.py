@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -40,8 +41,9 @@ class CurriculumCallback(BaseCallback):
 
     Raises ConfigError if kind or settings are wrong; and when `learn` begins, if it was given two of these, the model,
     its environment or its instances cannot give the curriculum what it asks for, the model remembers another
-    curriculum, or an EvalCallback beside it has the model's own environment. Raises SpaceDistError if training
-    diverges, what the model remembers cannot be read, or another callback resets or steps the environment.
+    curriculum, or an EvalCallback beside it has the model's own environment, or one whose observations are of another
+    shape. Raises SpaceDistError if training diverges, what the model remembers cannot be read, or another callback
+    resets or steps the environment.
     """
 
     def __init__(
@@ -97,12 +99,8 @@ class CurriculumCallback(BaseCallback):
             raise ConfigError(f"learn was given {count} CurriculumCallbacks, and a model is trained by one curriculum")
         wrapped = Wrapped(self.model.get_env())
         for one in beside:
-            if isinstance(one, EvalCallback) and _innermost(one.eval_env) is wrapped.env:
-                name = type(one).__name__
-                raise ConfigError(
-                    f"CurriculumCallback: {name} has the env that is being trained on, whose episodes the curriculum "
-                    f"chooses; give {name} a ContextVecEnv of its own"
-                )
+            if isinstance(one, EvalCallback):
+                self._refuse_evaluation(one, wrapped)
         if self._session is None or not self._session.is_of(self.model, wrapped.env):
             self._session = Session(self._asked, self.model, wrapped)
             remembered = getattr(self.model, STATE, None) if self._resume else None
@@ -112,6 +110,21 @@ class CurriculumCallback(BaseCallback):
                 self._session.remember(remembered)
         self._session.wrapped = wrapped
         self._time = None
+
+    def _refuse_evaluation(self, beside: EvalCallback, wrapped: Wrapped) -> None:
+        """Refuse an evaluation in the env that is being trained on, or in one that the model cannot act in."""
+        name, env, space = type(beside).__name__, beside.eval_env, self.model.observation_space
+        if _innermost(env) is wrapped.env:
+            raise ConfigError(
+                f"CurriculumCallback: {name} has the env that is being trained on, whose episodes the curriculum "
+                f"chooses; give {name} a ContextVecEnv of its own"
+            )
+        if _shapes(env.observation_space) != _shapes(space):
+            seen = ", which have the context in them" if wrapped.env.context_visible else ""
+            raise ConfigError(
+                f"CurriculumCallback: {name} has an env whose observations are of another shape than those that the "
+                f"model acts on{seen}; give {name} a ContextVecEnv of its own, wrapped as the model's env is"
+            )
 
     def _on_rollout_start(self) -> None:
         self._refuse_others_steps(0)
@@ -161,6 +174,13 @@ def _callbacks(callback: object) -> Iterator[object]:
     for one in held:
         if one is not None:
             yield from _callbacks(one)
+
+
+def _shapes(space: spaces.Space[Any]) -> object:
+    """Of observations, as far as a model minds: SB3 itself turns images."""
+    if isinstance(space, spaces.Dict):
+        return {key: _shapes(part) for key, part in space.spaces.items()}
+    return sorted(space.shape) if isinstance(space, spaces.Box) else space
 
 
 def _innermost(env: VecEnv) -> VecEnv:
