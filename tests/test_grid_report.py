@@ -131,10 +131,14 @@ def test_every_number_says_how_many_seeds_it_rests_on(grid: Grid, written: Path)
     assert "| robin (baseline) | 3/3 | — | 3.000 [-3.572, 9.572] (3/3) | 3.000 [-3.572, 9.572] (3/3) |" in text
     assert "| b | 2/3 | 1 failed: out of memory | 9.000 [—] (2/3) |" in text
     assert "| d | 2/3 | 1 waiting | 4.500 [—] (2/3) |" in text
-    assert "1.00 [—] (2/3 against 3/3)" in text
-    few = "Intervals here rest on fewer than 10 seeds (robin: 3; a: 3; b: 2; c: 3; d: 2)"
-    assert few in text.partition("| cell |")[0]
-    assert few in (written / "report.html").read_text()
+    assert "1.00 [—] (2/3 seeds against 3/3)" in text
+    page, before = (written / "report.html").read_text(), text.partition("| cell |")[0]
+    for few in (
+        "Intervals here rest on fewer than 10 seeds (robin: 3; a: 3; c: 3): they are wide, ",
+        "Over fewer than 3 seeds there is no interval (b: 2; d: 2): ",
+    ):
+        assert few in before
+        assert few in page
     checked = 0
     for head, body in re.findall(r"(?m)^(\| cell .*)\n\| ---.*\n((?:\|.*\n)+)", text):
         columns = head.split(" | ")
@@ -515,6 +519,9 @@ def test_many_cells_are_drawn_in_panels(tmp_path: Path) -> None:
         "Untestable steps to the threshold, one seed shows no noise at step 0, more seeds do: a=1 b=1, a=1 b=2, "
     )
     assert report.table[3]["test return, IQM [95 %]"] == "3.000 [—] (1/1)"
+    assert report.table[3]["P(better)"] == "1.00 [—] (1/1 seed against 1/1)"
+    early = report.markdown.partition("## Early")[2].partition("## ")[0]
+    assert early.count("(1/1 seed against 1/1) |") == early.count("(1/1 pair) |") == 8
 
 
 # ---- the command line -----------------------------------------------------------------------------------------------

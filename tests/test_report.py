@@ -335,8 +335,10 @@ def test_unfinished_runs_are_shown_and_not_counted(tmp_path: Path) -> None:
     assert row["seeds finished"] == "1/3"
     assert row["test return, IQM [95 %]"] == "1.000 [—]"
     few, remark = report.remarks
-    assert "(space: 1)" in few
-    assert "Below 3 seeds there is none." in few
+    assert (
+        few == "Over fewer than 3 seeds there is no interval (space: 1): one seed cannot tell how far seeds differ, "
+        "and two hardly can."
+    )
     assert "seed 1 failed at 2,000 of 4,000 steps (worker died);" in remark
     assert "seed 2 left behind by a process that is gone at 0 of 4,000 steps" in remark
     assert remark in report.markdown

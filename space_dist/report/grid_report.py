@@ -44,7 +44,7 @@ from space_dist.report.grid import (
 )
 from space_dist.report.instances import forgetting_rows, instance_sections
 from space_dist.report.load import Configuration
-from space_dist.report.measures import Measured, measure_numbers, measure_sections, measured, paired_cell
+from space_dist.report.measures import Measured, against_in_words, measure_numbers, measure_sections, measured, paired_cell
 from space_dist.report.released import released_section
 from space_dist.report.statistics import FEWEST, Interval, estimate
 from space_dist.report.tables import (
@@ -57,6 +57,7 @@ from space_dist.report.tables import (
     number_text,
     numbers,
     reached_text,
+    share_text,
     size_text,
     steps_text,
     to_csv,
@@ -72,8 +73,8 @@ _TITLE: Final = "Grid"
 _METHOD: Final = tuple(
     " ".join(paragraph.split())
     for paragraph in f"""
-Round brackets say how many of a cell's seeds a number rests on: (9/10) are nine finished seeds of ten. Runs that are
-not finished count in no number.
+Round brackets say how many of a cell's seeds a number rests on: (9/10) are nine finished seeds of ten, and (9/10 seeds
+against 10/10) are compared with all ten of the baseline. Runs that are not finished count in no number.
 
 Final returns are undiscounted means over the held-out (test) instances at each finished run's last step. IQM:
 interquartile mean over seeds (below four seeds the plain mean). Intervals in square brackets are to cover 95 %: from
@@ -307,7 +308,7 @@ def _untestable(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> li
 
 
 def _with_seeds(text: str, n: int, of: int, what: str = "") -> str:
-    return f"{text} ({n}/{of}{what})"
+    return f"{text} ({share_text(n, of, what) if what else f'{n}/{of}'})"
 
 
 def _name(cell: CellRuns, comparison: Comparison) -> str:
@@ -338,9 +339,9 @@ def _finals(
 def _improvement(cell: CellRuns, comparison: Comparison) -> str:
     if comparison.improvement is None or comparison.reference is None:
         return NONE
-    theirs = comparison.reference.summary
-    text = interval_text(comparison.improvement, 2)
-    return _with_seeds(text, cell.summary.test.n, cell.summary.n_runs, f" against {theirs.test.n}/{theirs.n_runs}")
+    ours, theirs = cell.summary, comparison.reference.summary
+    rests_on = against_in_words(ours.test.n, ours.n_runs, theirs.test.n, theirs.n_runs)
+    return f"{interval_text(comparison.improvement, 2)} ({rests_on})"
 
 
 def _steps_row(cell: CellRuns, comparison: Comparison) -> dict[str, str]:
@@ -360,7 +361,7 @@ def _steps_row(cell: CellRuns, comparison: Comparison) -> dict[str, str]:
 def _ratio(comparison: Comparison, n_seeds: int) -> str:
     if comparison.ratio is None:
         return NONE
-    return _with_seeds(interval_text(comparison.ratio, 2), comparison.pairs, n_seeds, " pairs")
+    return _with_seeds(interval_text(comparison.ratio, 2), comparison.pairs, n_seeds, "pair")
 
 
 def _training_row(cell: CellRuns) -> dict[str, str]:
@@ -423,7 +424,7 @@ def _failed(cells: Sequence[CellRuns]) -> list[Section]:
 def _pooled(cells: Sequence[CellRuns]) -> list[Section]:
     rows = [
         {"setting": found.setting, "cells": f"{found.n_cells}",
-         "test return, IQM [95 %]": _with_seeds(interval_text(found.iqm), found.n_finished, found.n_runs, " runs")}
+         "test return, IQM [95 %]": _with_seeds(interval_text(found.iqm), found.n_finished, found.n_runs, "run")}
         for found in pool(cells)
     ]  # fmt: skip
     text = ("The final test return of all cells with a setting, whatever their others; the intervals are stratified by "

@@ -18,7 +18,7 @@ from space_dist.report.grid import CellRuns, Comparison
 from space_dist.report.load import Run
 from space_dist.report.outcomes import PairedDifference, area, cross_worst_mean, paired_difference
 from space_dist.report.statistics import Estimate, Interval, estimates, probability_of_improvement
-from space_dist.report.tables import NONE, Value, interval_numbers, interval_text
+from space_dist.report.tables import NONE, Value, interval_numbers, interval_text, share_text
 
 WORST: Final = 0.1  # of the held-out instances
 MEASURES: Final[Mapping[str, str]] = {
@@ -32,13 +32,14 @@ MEASURES: Final[Mapping[str, str]] = {
 class Measured:
     """One measure of a cell: the IQM over its finished seeds, and how it compares with the reference, by seed.
 
-    n, against: seeds, and those of the reference. improvement, difference: None for the reference itself, and where
-    there is none.
+    n, against: seeds, and those of the reference, which has `against_of` in all. improvement, difference: None for the
+    reference itself, and where there is none.
     """
 
     n: int
     iqm: Interval
     against: int = 0
+    against_of: int = 0
     improvement: Interval | None = None
     difference: PairedDifference | None = None
 
@@ -52,14 +53,15 @@ def measured(cells: Sequence[CellRuns], compared: Sequence[Comparison]) -> list[
     for place, (cell, comparison) in enumerate(zip(cells, compared, strict=True)):
         reference = comparison.reference
         theirs = {} if reference is None or reference is cell else values[reference.cell.id]
+        of = 0 if reference is None else reference.summary.n_runs
         found.append(
-            {name: _measured(iqms[name][place], values[cell.cell.id][name], theirs.get(name)) for name in MEASURES}
+            {name: _measured(iqms[name][place], values[cell.cell.id][name], theirs.get(name), of) for name in MEASURES}
         )
     return found
 
 
-def _measured(known: Estimate, ours: Mapping[int, float], theirs: Mapping[int, float] | None) -> Measured:
-    """One measure, by seed, beside the reference's; None: there is no reference."""
+def _measured(known: Estimate, ours: Mapping[int, float], theirs: Mapping[int, float] | None, of: int) -> Measured:
+    """One measure, by seed, beside the reference's, which has `of` seeds in all; None: there is no reference."""
     if theirs is None:
         return Measured(known.n, known.iqm)
     both = sorted({*ours} & {*theirs})
@@ -68,6 +70,7 @@ def _measured(known: Estimate, ours: Mapping[int, float], theirs: Mapping[int, f
         known.n,
         known.iqm,
         len(theirs),
+        of,
         probability_of_improvement(np.array([*ours.values()]), np.array([*theirs.values()])),
         paired_difference(*pairs) if both else None,
     )
@@ -129,13 +132,19 @@ def paired_cell(found: Measured, n_seeds: int) -> dict[str, str]:
     if pairs is None:
         return {"difference by seed [95 %], Wilcoxon p": NONE}
     p = NONE if math.isnan(pairs.p) else f"{pairs.p:.3g}"
-    return {"difference by seed [95 %], Wilcoxon p": f"{interval_text(pairs.mean)}, {p} ({pairs.n}/{n_seeds} pairs)"}
+    text = f"{interval_text(pairs.mean)}, {p} ({share_text(pairs.n, n_seeds, 'pair')})"
+    return {"difference by seed [95 %], Wilcoxon p": text}
 
 
 def _improvement(found: Measured, n_seeds: int) -> str:
     if found.improvement is None:
         return NONE
-    return f"{interval_text(found.improvement, 2)} ({found.n}/{n_seeds} against {found.against})"
+    return f"{interval_text(found.improvement, 2)} ({against_in_words(found.n, n_seeds, found.against, found.against_of)})"
+
+
+def against_in_words(ours: int, of_ours: int, theirs: int, of_theirs: int) -> str:
+    """`9/10 seeds against 10/10`: on how many of a cell's and its reference's seeds a comparison rests."""
+    return f"{share_text(ours, of_ours, 'seed')} against {theirs}/{of_theirs}"
 
 
 def measure_numbers(found: Mapping[str, Measured]) -> dict[str, Value]:

@@ -98,17 +98,32 @@ def remarks(configuration: Configuration) -> list[str]:
 
 def few_seeds(counts: Mapping[str, int]) -> list[str]:
     """What is to be known before intervals over a few seeds are read; `counts`: how many seeds each label has."""
-    few = {label: count for label, count in counts.items() if 0 < count < ENOUGH}
-    if not few:
-        return []
-    named = [f"{label}: {count}" for label, count in list(few.items())[:MAX_NAMED]]
-    more = f"; and {len(few) - MAX_NAMED:,} more" if len(few) > MAX_NAMED else ""
-    without = f" Below {FEWEST} seeds there is none." if min(few.values()) < FEWEST else ""
-    return [
-        f"Intervals here rest on fewer than {ENOUGH} seeds ({'; '.join(named)}{more}): they are wide, and cover their "
-        "95 % only if the seeds are much alike. Where some seeds fail, or all end at the same limit, an interval "
-        f"over three seeds covers 81 to 90 %, one over five 93 to 96 %.{without}"
-    ]
+    without = {label: count for label, count in counts.items() if 0 < count < FEWEST}
+    few = {label: count for label, count in counts.items() if FEWEST <= count < ENOUGH}
+    sentences = []
+    if few:
+        sentences.append(
+            f"Intervals here rest on fewer than {ENOUGH} seeds ({_counts(few)}): they are wide, and cover their "
+            "95 % only if the seeds are much alike. Where some seeds fail, or all end at the same limit, an interval "
+            "over three seeds covers 81 to 90 %, one over five 93 to 96 %."
+        )
+    if without:
+        sentences.append(
+            f"Over fewer than {FEWEST} seeds there is no interval ({_counts(without)}): one seed cannot tell how far "
+            "seeds differ, and two hardly can."
+        )
+    return sentences
+
+
+def _counts(seeds: Mapping[str, int]) -> str:
+    """`space: 3; round_robin: 2`, of the first few labels, and how many more there are."""
+    named = [f"{label}: {count}" for label, count in list(seeds.items())[:MAX_NAMED]]
+    return "; ".join([*named, *([f"and {len(seeds) - MAX_NAMED:,} more"] if len(seeds) > MAX_NAMED else [])])
+
+
+def share_text(n: int, of: int, what: str) -> str:
+    """`9/10 seeds`, `1/1 seed`."""
+    return f"{n}/{of} {what}{'' if of == 1 else 's'}"
 
 
 def caveats(configuration: Configuration) -> list[str]:
