@@ -566,6 +566,23 @@ def test_the_log_of_a_run_that_ends_by_episodes_ends_with_these(
     assert f"waiting, 0 of {SMALL['budget.steps']:,} steps, 0 of 40 episodes. " in capsys.readouterr().err
 
 
+def test_a_plan_tells_budgets_from_the_updates_that_fit_into_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An update takes 1,024 steps; cells show budgets. What may probe may leave room for fewer."""
+    path = write_grid(tmp_path, set=dict(SMALL) | {"budget.steps": 2500}, seeds=[0])
+    assert command(monkeypatch, "grid", "plan", path, "--root", tmp_path / "runs") == 0
+    said = capsys.readouterr().out
+    fit = "= 2 runs, 4,096 environment steps in whole updates (budgets: 5,000, which no further update fits into); "
+    assert fit in said
+    assert said.count("0% of 2,500") == 2
+
+    probing = {"curriculum": {"kind": "learnability"}}
+    path = write_grid(tmp_path, set=dict(SMALL) | probing, seeds=[0], grid={"learner.gamma": [0.9, 0.99]})
+    assert command(monkeypatch, "grid", "plan", path, "--root", tmp_path / "runs") == 0
+    assert "= 2 runs, at most 4,096 environment steps in whole updates; " in capsys.readouterr().out
+
+
 def test_episodes_that_end_runs_are_planned_and_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

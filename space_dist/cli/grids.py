@@ -18,7 +18,7 @@ from space_dist.cli.overview import (
     Watching,
     display,
     episodes_of,
-    or_episodes,
+    planned_steps,
     print_cells,
     print_stand,
     status_json,
@@ -110,7 +110,7 @@ def grid_plan(
     manifest = made.manifest
     found = run_statuses(made.grid, manifest, code_digest())
     done = [run_status for run_status in found if run_status.condition == "done"]
-    left = sum(run_status.budget_steps for run_status in found) - sum(run_status.steps for run_status in found)
+    left = sum(one.budget_steps - one.steps for one in found if one.condition != "done")
     if as_json:
         print_json({
             "grid": manifest.name, "folder": str(made.grid.folder), "seeds": list(manifest.seeds), "runs": len(found),
@@ -123,7 +123,7 @@ def grid_plan(
     print_cells(manifest, found)
     say(
         f"{counted(len(manifest.cells), 'cell')} x {counted(len(manifest.seeds), 'seed')} = "
-        f"{counted(len(found), 'run')}, {made.steps:,} environment steps in whole updates{or_episodes(manifest)}; "
+        f"{counted(len(found), 'run')}, {planned_steps(made)}; "
         f"{counted(manifest.cpus_per_run, 'CPU')} a run"
         + (" or population: runs of one shape share a process" if any(cell.stack for cell in manifest.cells) else "")
     )

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from space_dist.experiment.manifest import Cell, Grid, Manifest
     from space_dist.experiment.status import RunStatus
     from space_dist.grid.conductor import Overview
+    from space_dist.grid.planning import Plan
     from space_dist.ledger import Ledger
     from space_dist.slurm.queue import Queue
 
@@ -192,7 +193,15 @@ def _cell_row(cell: Cell, found: Sequence[RunStatus]) -> dict[str, str]:
     }  # fmt: skip
 
 
-def or_episodes(manifest: Manifest) -> str:
+def planned_steps(made: Plan) -> str:
+    """What the runs of a planned grid take; where their budgets, which its cells show, are more, those, too."""
+    budgets = sum(run.cell.budget_steps for run in made.manifest.runs())
+    budgeted = "" if made.steps == budgets else f" (budgets: {budgets:,}, which no further update fits into)"
+    most = "at most " if made.at_most else ""
+    return f"{most}{made.steps:,} environment steps in whole updates{budgeted}{_or_episodes(made.manifest)}"
+
+
+def _or_episodes(manifest: Manifest) -> str:
     """What else ends the runs of a grid than their steps."""
     limits = {cell.episodes_to_take for cell in manifest.cells}
     if limits == {None}:

@@ -25,11 +25,16 @@ from space_dist.tracking.settling import settled
 
 @dataclass(frozen=True)
 class Plan:
-    """A frozen grid, and how it differs from what was frozen in its folder before. steps: of all runs together."""
+    """A frozen grid, and how it differs from what was frozen in its folder before.
+
+    steps: of all runs together, in whole updates.  at_most: whether they may be fewer, for their curricula may probe
+    between updates, or their rounds end by episodes.
+    """
 
     grid: Grid
     manifest: Manifest
     steps: int
+    at_most: bool
     new_runs: int
     dropped_runs: int
 
@@ -48,7 +53,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence
     files = InstanceFiles()
     specs: dict[str, EnvironmentSpec] = {}  # by the section of a config: an environment is looked at once
     cells: dict[str, Cell] = {}
-    steps = 0
+    steps, at_most = 0, False
     for point, data in points:
         label = label_of(point, config.axes())
         where = f"{path}, cell {label!r}"
@@ -58,6 +63,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence
             raise ConfigError(f"{path}: the cells {cells[cell.id].label!r} and {label!r} are the same run config")
         cells[cell.id] = cell
         steps += run_steps * len(seeds)
+        at_most |= resolved.curriculum.may_probe or resolved.n_episodes is not None
     manifest = Manifest(
         name=name, axes=tuple(config.axes()), cells=_distinct(cells.values()), seeds=seeds,
         resources=config.resources, retry=config.retry,
@@ -69,7 +75,7 @@ def plan(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence
     )  # fmt: skip
     before = freeze(grid, manifest, files.contents)
     now, then = ({run.key for run in one.runs()} if one else set[str]() for one in (manifest, before))
-    return Plan(grid, grid.manifest(), steps, len(now - then), len(then - now))
+    return Plan(grid, grid.manifest(), steps, at_most, len(now - then), len(then - now))
 
 
 class InstanceFiles:

@@ -44,7 +44,14 @@ from space_dist.report.grid import (
 )
 from space_dist.report.instances import forgetting_rows, instance_sections
 from space_dist.report.load import Configuration
-from space_dist.report.measures import Measured, against_in_words, measure_numbers, measure_sections, measured, paired_cell
+from space_dist.report.measures import (
+    Measured,
+    against_in_words,
+    measure_numbers,
+    measure_sections,
+    measured,
+    paired_cell,
+)
 from space_dist.report.released import released_section
 from space_dist.report.statistics import FEWEST, Interval, estimate
 from space_dist.report.tables import (

@@ -139,7 +139,8 @@ def paired_cell(found: Measured, n_seeds: int) -> dict[str, str]:
 def _improvement(found: Measured, n_seeds: int) -> str:
     if found.improvement is None:
         return NONE
-    return f"{interval_text(found.improvement, 2)} ({against_in_words(found.n, n_seeds, found.against, found.against_of)})"
+    rests_on = against_in_words(found.n, n_seeds, found.against, found.against_of)
+    return f"{interval_text(found.improvement, 2)} ({rests_on})"
 
 
 def against_in_words(ours: int, of_ours: int, theirs: int, of_theirs: int) -> str:
