@@ -9,7 +9,9 @@ from space_dist.config import DQNConfig, RunConfig
 from space_dist.errors import ConfigError
 from space_dist.ledger import Checkpoint, Status
 
-_GROWS: Final = "the budget of a run that is there may only grow: use --out DIR for a new run (from Python: out=DIR)"
+_GROWS: Final = (
+    "the budget of a run that is there may only grow, and a larger one counts from when the run was first asked for it"
+)
 
 
 def is_longer(before: RunConfig, now: RunConfig) -> bool:
@@ -22,9 +24,10 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
     if old == new:
         return False
     if new.steps < old.steps:
-        raise ConfigError(f"budget.steps: {old.steps} -> {new.steps}: {_GROWS}")
+        raise ConfigError(_refused("steps", f"{old.steps} -> {new.steps}", str(old.steps)))
     if new.episodes is not None and (old.episodes is None or new.episodes < old.episodes):
-        raise ConfigError(f"budget.episodes: {old.episodes or 'no limit'} -> {new.episodes}: {_GROWS}")
+        change = f"{old.episodes or 'no limit'} -> {new.episodes}"
+        raise ConfigError(_refused("episodes", change, str(old.episodes or "null")))
     # Rows and checkpoints that are there must be those that the larger budget would have given.
     reason = _goes_by_budget(before)
     if reason is not None:
@@ -34,6 +37,14 @@ def is_longer(before: RunConfig, now: RunConfig) -> bool:
             "has, this one goes on"
         )
     return True
+
+
+def _refused(key: str, change: str, now: str) -> str:
+    """A smaller budget, and with which one the run goes on now."""
+    return (
+        f"budget.{key}: {change}: {_GROWS}: --set budget.{key}={now} goes on with it (from Python: overrides), --out "
+        "DIR starts another (out=DIR)"
+    )
 
 
 def _grown(before: RunConfig, now: RunConfig) -> str:
