@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -69,6 +69,31 @@ def nearest(word: str, allowed: Iterable[str]) -> str:
     close = [name for name in names if word and name.startswith(f"{word}_")]  # cpus: cpus_per_task rather than gpus
     close = close or difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else "."
+
+
+def nearest_label(word: str, labels: Sequence[str]) -> str:
+    """The same of labels of several words, whose beginning alone, or one of the words, may be meant, in any case."""
+    if (whole := nearest(word, labels)) != ".":
+        return whole
+    parts: dict[str, str] = {}
+    for label in labels:
+        for part in (label[: len(word)], *re.split(r"[\s_=]+", label)):
+            parts.setdefault(part.casefold(), label)
+    close = difflib.get_close_matches(word.casefold(), parts, n=1, cutoff=0.6)
+    return f"; did you mean {parts[close[0]]!r}?" if close else "."
+
+
+def missing_folder(path: Path, shown: Callable[[Path], str] = str) -> str:
+    """`; there is no folder docs/resluts; did you mean 'results'?` of a path that does not exist: the first folder on
+    the way to it that is not there, and the nearest one beside that. Empty where only its last part is missing.
+    """
+    missing = path
+    while not missing.parent.exists() and missing.parent != missing:
+        missing = missing.parent
+    if missing == path:
+        return ""
+    beside = sorted(other.name for other in missing.parent.glob("*/"))
+    return f"; there is no folder {shown(missing)}{nearest(missing.name, beside)}"
 
 
 def misspelt(word: str, allowed: Iterable[str]) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from space_dist.config.shipped import located
-from space_dist.errors import ConfigError, about, nearest
+from space_dist.errors import ConfigError, about, missing_folder, nearest
 
 MAX_FILE_BYTES: Final = 512 * 2**20
 MAX_LINE_BYTES: Final = 2**20  # some 40,000 features; a file without line ends never gets into memory whole
@@ -319,13 +319,8 @@ def _check_kind_and_size(path: Path) -> None:
 
 def _meant_path(path: Path) -> str:
     """A hint at the file, or at the first folder on the way to it that is misspelt; often empty."""
-    missing = path
-    while not missing.parent.exists() and missing.parent != missing:
-        missing = missing.parent
-    if missing == path:
-        return nearest(path.name, (file.name for file in path.parent.glob("*.csv"))).removesuffix(".")
-    what = f"; there is no folder {_shown_path(missing)}"
-    return what + nearest(missing.name, (other.name for other in missing.parent.glob("*/"))).removesuffix(".")
+    hint = missing_folder(path, _shown_path) or nearest(path.name, (file.name for file in path.parent.glob("*.csv")))
+    return hint.removesuffix(".")
 
 
 def _lines(file: BinaryIO, first_row: int) -> Iterator[tuple[int, bytes]]:

@@ -134,6 +134,18 @@ def train(*settings: str, out: object = "run", config: object = CONFIG) -> list[
         (["train", ROOT / "configs/pointmass_spce.yaml"], ["does not exist; did you mean", "/pointmass_space.yaml'"]),
         (["grid", "plan", ROOT / "configs/slurm/nope.yaml"], ["configs/slurm/nope.yaml does not exist."]),
         (["instances", "check", "nowhere.csv"], ["nowhere.csv"]),
+        *(
+            ([*words, ROOT / "docs/resluts/x"], ["there is no folder", "docs/resluts; did you mean 'results'?"])
+            for words in (
+                ["train"],
+                ["evaluate"],
+                ["report"],
+                ["sync"],
+                ["grid", "status"],
+                ["grid", "plan"],
+                ["render"],
+            )
+        ),
         (["instances", "check", str(TRAIN), str(TRAIN)], ["overlap"]),
         (["instances", "check", str(ROOT / "configs/instances/cartpole_train.csv")], ["length", "--env names another"]),
     ],

@@ -21,7 +21,7 @@ from space_dist import config as configs
 from space_dist.api.grids import frozen
 from space_dist.cli.grids import grid_retry
 from space_dist.cli.overview import _live_table, print_failures
-from space_dist.errors import ConfigError, LedgerError
+from space_dist.errors import ConfigError, LedgerError, NotPlannedError
 from space_dist.experiment.endings import Cause, Ended
 from space_dist.experiment.grid_file import GridConfig, label_of
 from space_dist.experiment.manifest import Grid, Manifest, Run, find_grid
@@ -297,6 +297,16 @@ def test_cells_and_grids_are_found_by_what_users_type(tmp_path: Path) -> None:
     assert manifest.cell("kappa=4") == manifest.cell(cell.id) == manifest.cell(cell.id[:6]) == cell
     with pytest.raises(ConfigError, match="did you mean 'kappa=4'"):
         manifest.cell("kapa=4")
+    with pytest.raises(ConfigError, match=r"no cell 'zz'\. It has 'kappa=1', 'kappa=4'$"):
+        manifest.cell("zz")
+    labels = ("round_robin", "space eta=0.1 kappa=1", "vds")
+    words = dataclasses.replace(manifest, cells=tuple(dataclasses.replace(cell, label=label) for label in labels))
+    meant_by = {"spcae": labels[1], "robni": labels[0], "vsd": "vds", "VDS": "vds", "eat": labels[1]}
+    for typed, meant in meant_by.items():
+        with pytest.raises(ConfigError, match=f"small has no cell '{typed}'; did you mean '{meant}'[?] It has 'round_"):
+            words.cell(typed)
+    with pytest.raises(NotPlannedError, match=r"/smal does not exist; did you mean 'small'[?]$"):
+        find_grid(tmp_path / "runs/smal", tmp_path / "runs")
     with pytest.raises(ConfigError, match="no seed 7; it has 0, 1"):
         manifest.run("kappa=4", 7)
     with pytest.raises(ConfigError, match="'kappa=4' of small has 2 seeds: choose one with --seed: 0, 1"):

@@ -17,7 +17,7 @@ from ruamel.yaml.events import AliasEvent
 
 from space_dist.config.quoting import clean, short
 from space_dist.config.sections import MAX_LIST
-from space_dist.errors import ConfigError
+from space_dist.errors import ConfigError, missing_folder
 
 _MAX_CONFIG_BYTES = 64 << 10  # over twenty times the longest that ships
 _MAX_ALIASES = 20  # each may double what a file means
@@ -87,7 +87,9 @@ class _ValueFaultError(ValueError):
 
 
 def _beside(path: Path) -> str:
-    """A hint at the file in the same folder whose name, its ending aside, is nearly this one."""
+    """A hint at a missing folder, or at the file beside it whose name, its ending aside, is nearly this one."""
+    if hint := missing_folder(path):
+        return hint
     files = {file.stem: file for file in sorted(path.parent.glob("*.yaml"))} if path.parent.is_dir() else {}
     close = difflib.get_close_matches(path.stem, files, n=1, cutoff=_ALIKE)
     return f"; did you mean {str(files[close[0]])!r}?" if close else "."

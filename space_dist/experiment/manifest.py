@@ -22,7 +22,7 @@ from typing import Any
 
 from space_dist import config as configs
 from space_dist.config import NAME, ResourcesConfig, RunConfig, Section
-from space_dist.errors import ConfigError, LedgerError, NotPlannedError, below, nearest
+from space_dist.errors import ConfigError, LedgerError, NotPlannedError, below, nearest, nearest_label
 from space_dist.experiment import scaling
 from space_dist.experiment.grid_file import GridConfig, GridTracking, Retry, RunResources, refuse_others
 from space_dist.experiment.search import Search
@@ -167,8 +167,11 @@ class Manifest:
                 "label, or more of the id"
             )
         names = [name for cell in self.cells for name in (cell.label, cell.id)]
-        hint = f"; did you mean {begun[0].label!r}?" if begun else nearest(text, names)
-        raise ConfigError(f"{self.name} has no cell {text!r}{hint} `space-dist grid status {self.name}` lists them")
+        hint = f"; did you mean {begun[0].label!r}?" if begun else nearest_label(text, names)
+        listed = f"`space-dist grid status {self.name}` lists them"
+        if len(self.cells) <= _MAX_NAMED:
+            listed = f"It has {', '.join(repr(cell.label) for cell in self.cells)}"
+        raise ConfigError(f"{self.name} has no cell {text!r}{hint} {listed}")
 
     def run(self, cell: str, seed: int | None) -> Run:
         """One run; without a seed, of a cell that has one alone. Raises ConfigError if there is no such one."""
@@ -353,6 +356,15 @@ def _below(folder: Path) -> str:
     return below([file.parent for file in files if Grid(file.parent).is_own()])
 
 
+def _refuse_misspelt_folder(path: Path) -> None:
+    """Raise NotPlannedError, with the nearest folder, for what is not there, nor a file but for its ending."""
+    if path.exists() or path.suffix or ":" in path.name or path.with_name(f"{path.name}.yaml").exists():
+        return
+    hint = nearest(path.name, sorted(other.name for other in path.parent.glob("*/")))
+    if hint != ".":
+        raise NotPlannedError(f"{path} does not exist{hint}")
+
+
 def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Sequence[str] = ()) -> Grid:
     """The grid that a user names: its folder, its manifest.json, its name below `root`, or its YAML file (frozen below
     `root`, at a scale and with changes).
@@ -376,6 +388,7 @@ def find_grid(path: Path, root: Path, scale: float = scaling.WHOLE, changes: Seq
         return Grid(path)
     if path.name == MANIFEST:
         return Grid(path.absolute().parent)
+    _refuse_misspelt_folder(path)
     data = configs.read_named(path)
     refuse_others(data, path)
     config = configs.check(GridConfig, data, str(path))

@@ -39,7 +39,7 @@ from space_dist.ledger.checkpoint import (
     encode_arrays,
     encode_checkpoint,
 )
-from space_dist.ledger.folder import GIVEN, GOES_BACK, Ledger, State, Status, find_ledgers, there
+from space_dist.ledger.folder import GIVEN, GOES_BACK, Ledger, State, Status, absent, find_ledgers, there
 from space_dist.ledger.lock import LEASE_SECONDS, Lock, believed_alive, owner_alive, process_of, this_process
 from space_dist.ledger.rows import (
     CURRICULUM,
@@ -75,6 +75,7 @@ __all__ = [
     "Segment",
     "State",
     "Status",
+    "absent",
     "believed_alive",
     "decode_arrays",
     "decode_checkpoint",

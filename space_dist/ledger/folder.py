@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
-from space_dist.errors import LedgerError, NotPlannedError, below, nearest
+from space_dist.errors import LedgerError, NotPlannedError, below, missing_folder, nearest
 from space_dist.ledger.checkpoint import FORMAT, READABLE, Checkpoint, decode_checkpoint
 from space_dist.ledger.lock import owner_alive
 from space_dist.ledger.rows import METRICS, ROW_FILES, Row, decode_row
@@ -100,7 +100,7 @@ class Ledger:
             content = read_file(self.status_file, _MAX_STATUS_BYTES + 1)
         except FileNotFoundError:
             if not self.folder.exists():
-                raise NotPlannedError(_absent(self.folder)) from None
+                raise NotPlannedError(absent(self.folder)) from None
             kind = LedgerError if self.config.exists() else NotPlannedError
             raise kind(f"{self.folder} holds no run: it has no status.json{_below(self.folder)}") from None
         except NotADirectoryError:
@@ -224,10 +224,13 @@ class Ledger:
         return owner_alive(self.lock_file)
 
 
-def _absent(folder: Path) -> str:
-    """What to say of a folder that is not there, with the nearest name beside it."""
-    hint = nearest(folder.name, (other.name for other in folder.parent.glob("*/")))
-    return f"{folder} does not exist{hint.removesuffix('.')}"
+def absent(folder: Path, otherwise: str = "") -> str:
+    """What to say of a folder that is not there, with the nearest name beside it, or beside a folder on the way to it.
+
+    otherwise: a clause for where there is no such hint.
+    """
+    hint = missing_folder(folder) or nearest(folder.name, (other.name for other in folder.parent.glob("*/")))
+    return f"{folder} does not exist{hint.removesuffix('.') or otherwise}"
 
 
 def _file_in(path: Path) -> str:
@@ -245,7 +248,7 @@ def _below(folder: Path) -> str:
 def there(path: Path) -> Path:
     """The path that a user names as a run's, or as one that holds some. Raises NotPlannedError where nothing is."""
     if not path.exists():
-        raise NotPlannedError(_absent(path.absolute()))
+        raise NotPlannedError(absent(path.absolute()))
     return path
 
 

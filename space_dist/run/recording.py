@@ -11,7 +11,7 @@ from space_dist import config as configs
 from space_dist.curricula import GENERATED
 from space_dist.curricula.replay import Recording
 from space_dist.errors import ConfigError, LedgerError
-from space_dist.ledger import CURRICULUM, Ledger
+from space_dist.ledger import CURRICULUM, Ledger, absent
 from space_dist.system.files import read_file
 
 # A file that somebody names is read whole into memory: bounded.
@@ -31,7 +31,7 @@ def recording_in(path: Path) -> bytes:
     except LedgerError as error:
         raise ConfigError(f"{_KEY}: {error}") from None
     except FileNotFoundError:
-        raise ConfigError(f"{_KEY}: {path} does not exist; it is the folder of a run") from None
+        raise ConfigError(f"{_KEY}: {absent(path, '; it is the folder of a run')}") from None
     except OSError as error:
         raise ConfigError(f"{_KEY}: {path} cannot be read: {error.strerror}") from None
     except ValueError as error:

@@ -8,7 +8,7 @@ from typing import Final
 
 from space_dist.errors import ConfigError, LedgerError
 from space_dist.learner import Learner
-from space_dist.ledger import Ledger, decode_arrays, encode_arrays
+from space_dist.ledger import Ledger, absent, decode_arrays, encode_arrays
 from space_dist.system.files import read_file
 
 _WEIGHTS: Final = re.compile(r"(?:\d+/)?(?:policy/.*|normaliser/(?!running$).*)")  # of what a learner saves
@@ -34,7 +34,7 @@ def weights_in(path: Path) -> bytes:
     except LedgerError as error:
         raise ConfigError(f"init_from: {error}") from None
     except FileNotFoundError:
-        raise ConfigError(f"init_from: {path} does not exist; it is the folder of a run") from None
+        raise ConfigError(f"init_from: {absent(path, '; it is the folder of a run')}") from None
     except OSError as error:
         raise ConfigError(f"init_from: {path} cannot be read: {error.strerror}") from None
     except ValueError as error:
