@@ -67,7 +67,9 @@ def explain(
             f"{ledger.folder}: iteration {iteration + 1} trained on another set than these values lead to; "
             "jobs/audit.py says where they part"
         )
-    lines = [f"{config.name}, seed {config.seed}, {settings.kind}: iteration {iteration}, {row['steps']:,} steps{taken}"]
+    lines = [
+        f"{config.name}, seed {config.seed}, {settings.kind}: iteration {iteration}, {row['steps']:,} steps{taken}"
+    ]
     lines.append(f"Trained on: S = {before.size} of {len(train)} instances: {_listed(train.ids[before.selected])}")
     if isinstance(settings, GrowingConfig):
         lines += _growth(settings, feedback, before, state, numbers)

@@ -177,13 +177,13 @@ def _of_signal(found: Headroom) -> list[str]:
         return []
     share = found.over_all(found.signal[:, enough])
     gave = (
-        f"niform draws gave {min(1.0, share.value):.0%}{_span(share)} (IQM over seeds) of the signal that draws at even odds "
-        "would have given"
+        f"niform draws gave {min(1.0, share.value):.0%}{_span(share)} (IQM over seeds) of the signal that draws at "
+        "even odds would have given"
     )
     if not enough.all():
         return [
-            f"In the {enough.sum()} of {len(enough)} parts of the run in which {JUDGED} instances had two episodes, u{gave}. "
-            "Of the others it says nothing, and so nothing of the whole run: --steps gives longer runs."
+            f"In the {enough.sum()} of {len(enough)} parts of the run in which {JUDGED} instances had two episodes, "
+            f"u{gave}. Of the others it says nothing, and so nothing of the whole run: --steps gives longer runs."
         ]  # fmt: skip
     return [
         f"U{gave}: over these {found.steps:,} steps no curriculum over these instances can need less than that share "
