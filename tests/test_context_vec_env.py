@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack
+from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNormalize
 
 from space_dist.config.shipped import FOLDER
 from space_dist.errors import ConfigError, SpaceDistError
@@ -305,6 +305,23 @@ def test_evaluating_on_an_environment_without_the_context_is_refused() -> None:
             ppo(line_env()).learn(100, callback=callbacks)
     hidden = ContextVecEnv(LINE, TARGETS, SLOTS, context_visible=False)
     ppo(hidden).learn(16, callback=[CurriculumCallback("uniform"), bare])
+
+
+def test_evaluating_at_another_scale_is_refused() -> None:
+    plain, scaled = line_env, lambda: VecNormalize(line_env())
+    for trained, evaluated, said in (
+        (plain, scaled, "EvalCallback has a VecNormalize, and the model's env has none"),
+        (scaled, plain, "the model's env has a VecNormalize, and EvalCallback has none"),
+    ):
+        beside = EvalCallback(evaluated(), eval_freq=4, n_eval_episodes=2, verbose=0)
+        with pytest.raises(ConfigError, match=f"^CurriculumCallback: {said}, .*; wrap both "):
+            ppo(trained()).learn(100, callback=[CurriculumCallback("space"), beside])
+
+
+def test_a_normaliser_inside_is_told_where_it_belongs() -> None:
+    sentence = "a VecNormalize, a vectorised environment .*; return a single environment, and wrap the ContextVecEnv"
+    with pytest.raises(ConfigError, match=sentence):
+        ContextVecEnv(lambda: VecNormalize(line_env()), TARGETS, 2)
 
 
 def test_evaluating_on_an_environment_of_its_own_changes_nothing() -> None:

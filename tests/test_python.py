@@ -514,6 +514,12 @@ def test_who_resumes_where_nothing_is_hears_of_it(
     assert command(monkeypatch, "train", tmp_path / "run.yaml", "--out", tmp_path / "told", "--resume") == 0
     assert "beginning anew" not in capsys.readouterr().out
     monkeypatch.setattr(progress, "in_notebook", lambda: False)
+    for number, wanted in enumerate((True, lambda now: None)):  # in a batch job's file
+        space_dist.train(config, out=tmp_path / f"piped{number}", resume=True, progress=wanted)
+        said = f"tiny s0: beginning anew: there was no run in {tmp_path / f'piped{number}'}\n"
+        assert capsys.readouterr() == ("", said)
+    space_dist.train(config, out=tmp_path / "silent", resume=True, progress=False)
+    assert capsys.readouterr() == ("", "")
     monkeypatch.setattr(progress, "_on_terminal", lambda: True)
     space_dist.train(config, out=tmp_path / "called", resume=True)
     assert f"tiny s0: beginning anew: there was no run in {tmp_path / 'called'}" in "".join(

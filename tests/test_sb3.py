@@ -517,6 +517,9 @@ def test_another_curriculum_than_the_model_remembers_is_refused(tmp_path: Path) 
         loaded(TARGETS[:-1]).learn(40, callback=CurriculumCallback("space", eta=0.4))
     with pytest.raises(ConfigError, match=r"curriculum\.kappa was the default and is 2\. Ask"):
         loaded().learn(40, callback=CurriculumCallback("space", eta=0.4, kappa=2))
+    scaled = PPO.load(tmp_path / "m", env=VecNormalize(line_env()), device="cpu")
+    with pytest.raises(ConfigError, match=r"VecNormalize was of nothing and is of observations and rewards\. Ask"):
+        scaled.learn(40, callback=CurriculumCallback("space", eta=0.4))
     anew = CurriculumCallback("uniform", resume=False)
     loaded().learn(40, callback=anew)
     assert anew.selection.version == 1

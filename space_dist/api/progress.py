@@ -71,9 +71,10 @@ def in_notebook() -> bool:
 
 
 def keep(line: str, *, wanted: bool) -> None:
-    """Show a line that stays, whatever is shown later; nothing where nobody would look."""
-    if wanted and (in_notebook() or _on_terminal()):
-        print(line, flush=True)  # above what a terminal's last line is: rich sees to that
+    """Show a line that stays, whatever is shown later; beside a script's own output, if nobody watches that."""
+    if wanted:
+        # Above what a terminal's last line is: rich sees to that.
+        print(line, flush=True, file=None if in_notebook() or _on_terminal() else sys.stderr)
 
 
 def _on_terminal() -> bool:

@@ -164,7 +164,7 @@ def train(
             show(f"{run.name} s{run.seed}  {what}")
 
         def going_on(where: str) -> None:
-            keep(f"{run.name} s{run.seed}: {where}", wanted=progress is True)
+            keep(f"{run.name} s{run.seed}: {where}", wanted=progress is not False)
 
         outcome = launch(
             run, folder, resume=resume, stop=stop, observe=observe, waiting=waiting, tell=waiting, going_on=going_on

@@ -210,6 +210,13 @@ def _refuse_interface(where: str, env: Any) -> None:
             f"{where} made a Gymnasium vector environment, which resets by itself and so with no context; "
             "return a single gymnasium.Env instead"
         )
+    if any(
+        kind.__module__.startswith("stable_baselines3.") and kind.__name__ == "VecEnv" for kind in type(env).__mro__
+    ):
+        raise ConfigError(
+            f"{where} made a {type(env).__name__}, a vectorised environment of Stable-Baselines3's, which resets by "
+            "itself and so with no context; return a single environment, and wrap the ContextVecEnv made of it"
+        )
     missing = [name for name in ("reset", "step", "horizon", "observation_space", "action_space", "context_bounds")
                if not hasattr(env, name)]  # fmt: skip
     if missing:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 
 from space_dist.config import CustomConfig, check
 from space_dist.curricula import Selection
@@ -124,6 +124,12 @@ class CurriculumCallback(BaseCallback):
             raise ConfigError(
                 f"CurriculumCallback: {name} has an env whose observations are of another shape than those that the "
                 f"model acts on{seen}; give {name} a ContextVecEnv of its own, wrapped as the model's env is"
+            )
+        if (unwrap_vec_normalize(env) is None) != (self.model.get_vec_normalize_env() is None):
+            has, lacks = ("the model's env", name) if unwrap_vec_normalize(env) is None else (name, "the model's env")
+            raise ConfigError(
+                f"CurriculumCallback: {has} has a VecNormalize, and {lacks} has none, so that the model would be "
+                "evaluated on observations of another scale; wrap both (the one to evaluate in with training=False)"
             )
 
     def _on_rollout_start(self) -> None:

@@ -69,6 +69,13 @@ class Wrapped:
         return found[-1] if found else None
 
     @property
+    def scaled(self) -> str:
+        """What SB3's normaliser scales."""
+        found = self.normaliser
+        scaled = {"observations": found.norm_obs, "rewards": found.norm_reward} if found is not None else {}
+        return "of " + (" and ".join(what for what, so in scaled.items() if so) or "nothing")
+
+    @property
     def statistics(self) -> Statistics:
         """The scales of flat observations, and of rewards, as of now."""
         normaliser = self.normaliser

@@ -68,6 +68,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 STATE = "curriculum_state"  # the model's attribute
+_SCALED = "VecNormalize"  # in what it remembers
 _ROUND_STEPS = 512  # of an off-policy model, whose rollouts are a few steps; as `learner.n_steps` of a config
 _COMPARED_STARTS = 4096  # instances that are enough to see whether starts differ
 _MOST_TEXT = 1 << 30  # characters
@@ -419,9 +420,9 @@ class Session:
     # ---- what a model remembers ----
 
     def _identity(self) -> dict[str, Any]:
-        """What must be the same for a model to go on: settings, and the instances' digest."""
+        """What must be the same for a model to go on: settings, the instances' digest, and what is normalised."""
         asked = self._asked.model_dump(mode="json", exclude_defaults=True)
-        return {**asked, "instances": self.env.instances.digest()}
+        return {**asked, "instances": self.env.instances.digest(), _SCALED: self.wrapped.scaled}
 
     def _write(self) -> None:
         """Have the model remember how to go on from here."""
@@ -465,7 +466,7 @@ class Session:
                 raise ValueError(f"it is a {type(text).__name__}")
             checkpoint = decode_checkpoint(base64.b64decode(text, validate=True))
             asked, now = checkpoint.data["asked"], self._identity()
-            found = changes(asked, now)
+            found = changes({_SCALED: now[_SCALED], **asked}, now)  # models of before it was kept lack it
         others = ["the instances are others"] if found.pop("instances", None) else []
         differences = others + [
             f"{key} was {_told(before)} and is {_told(after)}" for key, (before, after) in found.items()
