@@ -42,8 +42,8 @@ class CurriculumCallback(BaseCallback):
     Raises ConfigError if kind or settings are wrong; and when `learn` begins, if it was given two of these, the model,
     its environment or its instances cannot give the curriculum what it asks for, the model remembers another
     curriculum, or an EvalCallback beside it has the model's own environment, or one whose observations are of another
-    shape. Raises SpaceDistError if training diverges, what the model remembers cannot be read, or another callback
-    resets or steps the environment.
+    shape or scale. Raises SpaceDistError if training diverges, what the model remembers cannot be read, or another
+    callback resets or steps the environment.
     """
 
     def __init__(

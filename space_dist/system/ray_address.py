@@ -7,7 +7,7 @@ from typing import Final
 
 from space_dist.errors import ConfigError, nearest
 
-JOB_SERVER: Final = ("http://", "https://")
+_JOB_SERVER: Final = ("http://", "https://")
 _NAMES: Final = ("local", "auto")  # of a Ray, beside HOST:PORT
 _ALLOWED: Final = "local, auto or HOST:PORT"
 _SCHEMES: Final = {
@@ -19,8 +19,8 @@ _SCHEMES: Final = {
 
 
 def split(address: str) -> tuple[str, int] | None:
-    """Host and port of HOST:PORT, with or without a scheme; None of anything else."""
-    host, _, port = address.rpartition("://")[2].rpartition(":")
+    """Host and port of HOST:PORT; None of anything else."""
+    host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         return None
     return host.strip("[]"), int(port)
@@ -47,7 +47,7 @@ def of_a_ray(address: str) -> str:
 
 def of_a_job_server(address: str | None) -> str | None:
     """The same for a job server's. Ray would try another as that of the cluster itself, for a minute."""
-    if address is not None and not address.startswith(JOB_SERVER):
+    if address is not None and not address.startswith(_JOB_SERVER):
         raise ConfigError(f"--address {address[:100]!r} is no job server: http://HOST:PORT, like http://127.0.0.1:8265")
     return address
 
