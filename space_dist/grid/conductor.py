@@ -37,7 +37,7 @@ from space_dist.ledger import Lock
 from space_dist.system.files import in_words, locked
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.provenance import code_digest
-from space_dist.tracking.pusher import LOOK_AT, Pusher
+from space_dist.tracking.pusher import LOOK_AT, NO_LONGER, Pusher
 
 log = logging.getLogger("space_dist")
 
@@ -389,8 +389,11 @@ def working_on(
             yield
     finally:  # the lock is released, by which the pusher knows that it may end
         if pusher is not None:
-            if warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid"):
-                say(f"warning: {warning}")
+            if not pusher.is_soon_over():
+                say(f"mirroring to {pusher.where}, for {_FINAL_PUSH_SECONDS:.0f} s at most")
+            with stop.nothing_left(NO_LONGER) as left:
+                if warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid", left):
+                    say(f"warning: {warning}")
             for page in pusher.pages():
                 say(f"{LOOK_AT}{page}")
 

@@ -50,7 +50,7 @@ from space_dist.system.extras import needed_from
 from space_dist.system.files import LogFile, in_words
 from space_dist.system.interrupts import StopRequests
 from space_dist.system.workplace import private_ray
-from space_dist.tracking.pusher import Pusher
+from space_dist.tracking.pusher import NO_LONGER, Pusher
 from space_dist.tracking.settling import settled
 
 log = logging.getLogger("space_dist")
@@ -187,7 +187,8 @@ class ActiveRun:
         """How it ended, once MLflow's mirror has what it can have."""
         if self.pusher is None:
             return self.outcome
-        warning = self.pusher.warning(_FINAL_PUSH_SECONDS, "run")
+        with self.stop.nothing_left(NO_LONGER) as left:
+            warning = self.pusher.warning(_FINAL_PUSH_SECONDS, "run", left)
         return replace(self.outcome, tracking_warning=warning, pages=tuple(self.pusher.pages()))
 
 

@@ -55,6 +55,7 @@ class StopRequests:
         self._grace_seconds = 25.0
         self._installed = False
         self._instead = ""
+        self._over: str | None = None
         self._since = time.time()
 
     def install(self, instead: str = "") -> None:
@@ -87,6 +88,19 @@ class StopRequests:
         finally:
             signal.signal = replace
             self.install()
+
+    @contextmanager
+    def nothing_left(self, instead: str) -> Iterator[Callable[[], bool]]:
+        """While all work is done, and something else is waited for: a first signal ends the waiting, and no process.
+
+        instead: what it does, in words. Yields whether one has come.
+        """
+        root = self if self._shared is None else self._shared
+        before, root._over = root._reason, instead
+        try:
+            yield lambda: root._reason is not before
+        finally:
+            root._over = None
 
     def watch(self, stop_file: Path, grace_seconds: float) -> None:
         """Also stop once `stop_file` exists."""
@@ -126,6 +140,10 @@ class StopRequests:
         return self._reason
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - the signature is Python's
+        if self._reason is None and self._over is not None:
+            self._reason = signal.Signals(number).name
+            self._tell(f"{self._reason}: {self._over}")
+            return
         if self._reason is not None:
             if number == signal.SIGINT:
                 where = "" if self._instead else ", on the last checkpoint that there is"

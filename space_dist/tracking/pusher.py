@@ -6,6 +6,8 @@ import contextlib
 import os
 import signal
 import subprocess
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
@@ -14,6 +16,9 @@ from space_dist.system.files import appending
 from space_dist.system.importing import PYTHON
 
 _KILL_SECONDS: Final = 5.0
+_SOON_SECONDS: Final = 2.0
+_LOOK_SECONDS: Final = 0.05
+NO_LONGER: Final = "no longer waiting for the mirror, which goes on by itself; all else is done"
 _MOST_SAID: Final = 1 << 20  # bytes of what it says that are looked through
 _REFUSED: Final = 2  # its exit code where somebody has to mend something first, which it says last
 _BEGINNING: Final = "space-dist: "  # of sentences on standard error
@@ -38,9 +43,28 @@ class Pusher:
                 command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
             )  # fmt: skip
 
-    def warning(self, seconds: float, what: Literal["run", "grid"]) -> str | None:
-        """None once it has ended well; after `seconds` it is ended, and this says what the mirror may lack."""
-        if ended_within(self._process, seconds):
+    def is_soon_over(self) -> bool:
+        """Whether it ends before anybody asks what is being waited for."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=_SOON_SECONDS)
+        return self._process.returncode is not None
+
+    def warning(
+        self, seconds: float, what: Literal["run", "grid"], leave: Callable[[], bool] = lambda: False
+    ) -> str | None:
+        """None once it has ended well; after `seconds` it is ended, and this says what the mirror may lack.
+
+        leave: whether to wait no longer, for it goes on by itself.
+        """
+        until = time.monotonic() + seconds
+        while self._process.poll() is None and time.monotonic() < until:
+            if leave():
+                return (
+                    f"{self.where} is still being brought up to date, by process {self._process.pid}; should that be "
+                    f"ended, too, `space-dist sync {self._folder}` does it (details: {self._log_file})"
+                )
+            time.sleep(_LOOK_SECONDS)
+        if ended_within(self._process, 0.0):
             return None
         # Negative: it was still at it, has said nothing maybe, and was ended.
         why = f" in {seconds:.0f} s" if self._process.returncode < 0 else ""

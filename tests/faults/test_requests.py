@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 from multiprocessing.process import BaseProcess
@@ -19,6 +21,7 @@ from space_dist import config as configs
 from space_dist.ledger import Ledger
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import STOP_SIGNALS, StopRequests
+from space_dist.tracking.pusher import NO_LONGER
 from tests import prepared
 from tests.faults.slow_env import PAUSE, STEPPING
 from tests.faults.test_every_write import short
@@ -134,6 +137,42 @@ def test_a_second_ctrl_c_ends_at_once_and_says_so(tmp_path: Path, monkeypatch: p
         "SIGINT: ending with a checkpoint, which takes up to 25 s; another Ctrl-C ends at once, without it",
         "SIGINT again: ended at once, on the last checkpoint that there is (exit code 75)",
     ]
+
+
+def test_a_finished_run_that_waits_for_its_mirror_alone_ends_at_once(tmp_path: Path) -> None:
+    said = tmp_path / "said.txt"
+    with socket.create_server(("127.0.0.1", 0)) as mute:  # the kernel takes connections, and nobody answers
+        uri = f"http://127.0.0.1:{mute.getsockname()[1]}"
+        process = prepared.command(command(tmp_path, f"tracking.uri={uri}", "budget.steps=64"), said)
+        try:
+            deadline = time.monotonic() + PATIENCE
+            while not (said.exists() and "mirroring to" in said.read_text()) and time.monotonic() < deadline:
+                time.sleep(0.01)
+            send(process, signal.SIGTERM)
+            process.join(PATIENCE)
+        finally:
+            process.kill()
+    assert process.exitcode == 0, said.read_text()
+    assert Ledger(tmp_path / "run").status().state == "done"
+    assert f"space-dist: SIGTERM: {NO_LONGER}\n" in said.read_text()
+    found = re.search(rf"MLflow at {uri} is still being brought up to date, by process (\d+);", said.read_text())
+    assert found, said.read_text()
+    with suppress(ProcessLookupError):
+        os.killpg(int(found[1]), signal.SIGKILL)
+
+
+def test_where_nothing_is_left_a_request_ends_no_process() -> None:
+    said: list[str] = []
+    asked = StopRequests(tell=said.append)
+    for stop in (StopRequests(shared=asked), asked):
+        with stop.nothing_left("on it goes") as left:
+            assert not left()
+            if stop is not asked:
+                asked._on_signal(signal.SIGTERM, None)
+                assert left()
+    assert said == ["SIGTERM: on it goes"]
+    assert not [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    assert asked.reason() == "SIGTERM"
 
 
 @pytest.mark.ray
