@@ -492,6 +492,7 @@ def test_a_run_of_another_configuration_is_told_by_its_kind(capsys: pytest.Captu
     told = error.replace("\n", "")
     assert code == 2
     assert f"{finished} already holds a run of another configuration: --out DIR starts another (from Python: " in told
+    assert told.endswith("There to here: curriculum.kind: space -> round_robin")
     code, _, error = run(capsys, *command, "--resume")
     assert code == 2
     assert "of another configuration (curriculum.kind: space -> round_robin). A run's" in error.replace("\n", "")

@@ -28,6 +28,7 @@ from space_dist.system.provenance import fingerprint
 
 log = logging.getLogger("space_dist")
 
+_MOST_CHANGES: Final = 5  # that a sentence tells
 _ANEW: Final = "beginning anew: no checkpoint had been written"
 
 
@@ -284,10 +285,12 @@ def already_there(config: RunConfig, ledger: Ledger) -> str:
     """That a run is there, and what to do, by whether it seems to be this one."""
     with contextlib.suppress(SpaceDistError):
         may_grow = ("budget.", "schedule")
-        if not all(text.startswith(may_grow) for text in configs.differences(stored_config(ledger), config)):
+        changes = _differences(stored_config(ledger), config)
+        if not all(text.startswith(may_grow) for text in changes):
+            more = f", and {len(changes) - _MOST_CHANGES} more" if len(changes) > _MOST_CHANGES else ""
             return (
                 f"{ledger.folder} already holds a run of another configuration: --out DIR starts another (from Python: "
-                "out=DIR)"
+                f"out=DIR). There to here: {', '.join(changes[:_MOST_CHANGES])}{more}"
             )
     return (
         f"{ledger.folder} already holds a run: --resume continues it, --out DIR starts another (from Python: "
