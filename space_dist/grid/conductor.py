@@ -389,9 +389,9 @@ def working_on(
             yield
     finally:  # the lock is released, by which the pusher knows that it may end
         if pusher is not None:
-            if not pusher.is_soon_over():
-                say(f"mirroring to {pusher.where}, for {_FINAL_PUSH_SECONDS:.0f} s at most")
             with stop.nothing_left(NO_LONGER) as left:
+                if not pusher.is_soon_over():
+                    say(f"mirroring to {pusher.where}, for {_FINAL_PUSH_SECONDS:.0f} s at most")
                 if warning := pusher.warning(_FINAL_PUSH_SECONDS, "grid", left):
                     say(f"warning: {warning}")
             for page in pusher.pages():

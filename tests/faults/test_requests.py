@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -18,6 +19,8 @@ import psutil
 import pytest
 
 from space_dist import config as configs
+from space_dist.grid import conductor
+from space_dist.grid.planning import plan
 from space_dist.ledger import Ledger
 from space_dist.run.launch import launch
 from space_dist.system.interrupts import STOP_SIGNALS, StopRequests
@@ -25,6 +28,7 @@ from space_dist.tracking.pusher import NO_LONGER
 from tests import prepared
 from tests.faults.slow_env import PAUSE, STEPPING
 from tests.faults.test_every_write import short
+from tests.grids import write_grid
 from tests.patience import PATIENCE
 from tests.test_learners import results
 
@@ -173,6 +177,39 @@ def test_where_nothing_is_left_a_request_ends_no_process() -> None:
     assert said == ["SIGTERM: on it goes"]
     assert not [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
     assert asked.reason() == "SIGTERM"
+
+
+def test_a_finished_grid_hears_a_request_as_soon_as_it_waits_for_its_mirror(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    stop = StopRequests(tell=said.append)
+
+    class Mirror:
+        where = "MLflow"
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def is_soon_over(self) -> bool:
+            stop._on_signal(signal.SIGTERM, None)
+            return False
+
+        def warning(self, seconds: float, what: str, leave: Callable[[], bool]) -> str:
+            return f"of a {what}, after {0 if leave() else seconds} s"
+
+        def pages(self) -> list[str]:
+            return []
+
+    monkeypatch.setattr(conductor, "Pusher", Mirror)
+    path = write_grid(tmp_path, tracking={"uri": "http://127.0.0.1:9"})
+    made = plan(path, tmp_path / "runs")
+    with conductor.working_on(made.grid, made.manifest, wait=False, stop=stop, say=said.append):
+        pass
+    assert said == [
+        f"SIGTERM: {NO_LONGER}", "mirroring to MLflow, for 300 s at most", "warning: of a grid, after 0 s",
+    ]  # fmt: skip
+    assert not [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
 
 
 @pytest.mark.ray
